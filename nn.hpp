@@ -1,13 +1,27 @@
 // nn.hpp: everything numerical that a decision transformer needs, and nothing about reinforcement learning.
+//
+// In order: errors; random numbers by counter; worker threads; matrix products; tensors and the tape; the operations of
+// the network, each with its backward; the decision transformer (DT, ODT sec. 3); policy heads; optimisers.
+// Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
+// number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
+// Leaves out: anything that knows what a return, an episode or a file is.
 #pragma once
 
+#include <algorithm>
 #include <array>
+#include <atomic>
 #include <cmath>
 #include <cstdarg>
+#include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <cstring>
+#include <memory>
+#include <new>
 #include <stdexcept>
 #include <string>
+#include <thread>
+#include <type_traits>
 #include <vector>
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -32,8 +46,8 @@ struct Error : std::runtime_error {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Random numbers by counter: a value is a function of (seed, stream, step, site, index) and of nothing else, so no order
-// of evaluation, number of threads or interruption can change it, and there is no generator state to save.
+// Random numbers by counter: a value is a function of (seed, stream, step, site, index) and of nothing else, so no
+// order of evaluation, number of threads or interruption can change it, and there is no generator state to save.
 
 using Words4 = std::array<uint32_t, 4>;
 
@@ -96,3 +110,1419 @@ struct Random {
         return std::sqrt(-2.0f * std::log(u)) * std::cos(angle);
     }
 };
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Threads. A fixed set of workers that share out numbered tasks. Who runs a task is left to chance; what a task
+// computes must depend on its number alone, so that results are the same for any number of threads.
+
+class Threads {
+  public:
+    // `count` >= 1 threads in all, the calling one among them.
+    explicit Threads(int count) {
+        for (int worker = 1; worker < count; ++worker) workers_.emplace_back([this, worker] { work(worker); });
+    }
+    ~Threads() {
+        stop_.store(true, std::memory_order_relaxed);
+        ticket_.fetch_add(uint64_t{1} << 32, std::memory_order_release);
+        ticket_.notify_all();
+        for (std::thread& worker : workers_) worker.join();
+    }
+    Threads(const Threads&) = delete;
+    Threads& operator=(const Threads&) = delete;
+
+    int count() const { return static_cast<int>(workers_.size()) + 1; }
+
+    // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
+    // f must not throw and must not call run().
+    template <class F>
+    void run(int tasks, F&& f) {
+        if (workers_.empty() || tasks < 2) {
+            for (int task = 0; task < tasks; ++task) f(task, 0);
+            return;
+        }
+        using Body = std::remove_reference_t<F>;
+        call_.store([](void* body, int task, int worker) { (*static_cast<Body*>(body))(task, worker); },
+                    std::memory_order_relaxed);
+        body_.store(const_cast<void*>(static_cast<const void*>(&f)), std::memory_order_relaxed);
+        tasks_.store(static_cast<uint32_t>(tasks), std::memory_order_relaxed);
+        unfinished_.store(tasks, std::memory_order_relaxed);
+        // Ticket = (generation, next task). The release makes the job above visible to whoever sees the generation.
+        const uint64_t generation = (ticket_.load(std::memory_order_relaxed) >> 32) + 1;
+        ticket_.store(generation << 32, std::memory_order_release);
+        ticket_.notify_all();
+        take_tasks(0);
+        for (int spins = 0; unfinished_.load(std::memory_order_acquire) != 0; ++spins) pause(spins);
+    }
+
+  private:
+    using Call = void (*)(void*, int, int);
+
+    static void pause(int spins) {
+        if (spins > 4000) std::this_thread::yield();
+#if defined(__x86_64__)
+        __builtin_ia32_pause();
+#endif
+    }
+
+    // Takes tasks until none is left. A late worker may read the next job's fields beside an old ticket; then the
+    // ticket has moved on, the exchange fails, and nothing was taken. Once a task is taken, run() cannot return, so
+    // the job stays.
+    uint64_t take_tasks(int worker) {
+        uint64_t ticket = ticket_.load(std::memory_order_acquire);
+        while (true) {
+            const Call call = call_.load(std::memory_order_relaxed);
+            void* body = body_.load(std::memory_order_relaxed);
+            const uint32_t task = static_cast<uint32_t>(ticket);
+            if (task >= tasks_.load(std::memory_order_relaxed)) return ticket;
+            if (!ticket_.compare_exchange_weak(ticket, ticket + 1, std::memory_order_acq_rel)) continue;
+            call(body, static_cast<int>(task), worker);
+            unfinished_.fetch_sub(1, std::memory_order_release);
+            ticket = ticket_.load(std::memory_order_acquire);
+        }
+    }
+
+    // Spins a little between jobs (they follow each other within microseconds), then sleeps.
+    void work(int worker) {
+        while (true) {
+            const uint64_t seen = take_tasks(worker);
+            for (int spins = 0; spins < 1000 && ticket_.load(std::memory_order_relaxed) == seen; ++spins) pause(spins);
+            ticket_.wait(seen, std::memory_order_acquire);
+            if (stop_.load(std::memory_order_relaxed)) return;
+        }
+    }
+
+    std::vector<std::thread> workers_;
+    std::atomic<uint64_t> ticket_{0};
+    std::atomic<Call> call_{nullptr};
+    std::atomic<void*> body_{nullptr};
+    std::atomic<uint32_t> tasks_{0};
+    std::atomic<int> unfinished_{0};
+    std::atomic<bool> stop_{false};
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Matrix products. C [M, N] = or += A [M, K] B [K, N]. Index order everywhere: row-major, last index fastest.
+
+// A matrix inside a larger one: element (i, j) at data[i * stride + j], or at data[j * stride + i] if transposed.
+template <class T>
+struct View {
+    T* data;
+    int stride;
+    bool transposed = false;
+    T& operator()(int i, int j) const {
+        return transposed ? data[static_cast<ptrdiff_t>(j) * stride + i] : data[static_cast<ptrdiff_t>(i) * stride + j];
+    }
+};
+
+// The order of additions is part of the definition: sums of `sum_block` products, each from zero and in order of k, are
+// added to C in order. It bounds the error for long K by about (sum_block + K / sum_block) * 2^-24 * sum |a b|, and
+// every kernel follows it, so an element does not depend on M, N, tile shapes or threads.
+constexpr int sum_block = 256;
+
+enum class Store { overwrite, accumulate };
+
+template <class T>
+void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int K, Store store) {
+    for (int i = 0; i < M; ++i)
+        for (int j = 0; j < N; ++j) {
+            if (store == Store::overwrite) c(i, j) = 0;
+            for (int first = 0; first < K; first += sum_block) {
+                T sum = 0;
+                for (int k = first; k < std::min(K, first + sum_block); ++k) sum += a(i, k) * b(k, j);
+                c(i, j) += sum;
+            }
+        }
+}
+
+// One tile of C from packed panels: a [depth, Rows], b [depth, Columns] (row stride b_stride), depth <= sum_block.
+// Writes (`add`: adds) the upper left rows x columns of the tile to c.
+using TileFunction = void (*)(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, int rows,
+                              int columns, bool add);
+
+// What a kernel must offer. Kernels of lower precision can join with panels and tiles of their own behind matmul().
+struct Kernel {
+    const char* name;
+    int tile_rows, tile_columns;
+    bool fused;  // multiply-add with one rounding: all fused kernels give the same bits, all others the plain ones
+    bool (*supported)();
+    TileFunction tile;
+    float (*burn)(int64_t rounds);  // arithmetic in registers alone, burn_flops() a round: the machine's peak
+};
+constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
+
+#if defined(__x86_64__) && !defined(__clang__)
+#define FUSED_KERNELS
+#endif
+#define ALWAYS_INLINE [[gnu::always_inline]] inline
+
+// sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so the fused form is one instruction by name.
+template <bool Fused, class Vector>
+ALWAYS_INLINE void multiply_add(Vector& sum, const Vector& a, const Vector& b) {
+#ifdef FUSED_KERNELS
+    if constexpr (Fused) {
+        asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
+        return;
+    }
+#endif
+    sum += a * b;
+}
+
+template <class Vector, int Rows, int Vectors, bool Fused>
+ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, int rows,
+                             int columns, bool add) {
+    typedef Vector Unaligned __attribute__((aligned(4), may_alias));
+    constexpr int lanes = sizeof(Vector) / sizeof(float), tile_columns = lanes * Vectors;
+    Vector sum[Rows][Vectors] = {};
+    for (int k = 0; k < depth; ++k) {
+        Vector row_of_b[Vectors];
+#pragma GCC unroll 4
+        for (int v = 0; v < Vectors; ++v) row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
+#pragma GCC unroll 16
+        for (int r = 0; r < Rows; ++r) {
+            const Vector element_of_a = a[r] - Vector{};  // a broadcast: x - 0 is x, also for -0
+#pragma GCC unroll 4
+            for (int v = 0; v < Vectors; ++v) multiply_add<Fused>(sum[r][v], element_of_a, row_of_b[v]);
+        }
+        a += Rows;
+        b += b_stride;
+    }
+    if (rows == Rows && columns == tile_columns) {
+#pragma GCC unroll 16
+        for (int r = 0; r < Rows; ++r)
+#pragma GCC unroll 4
+            for (int v = 0; v < Vectors; ++v) {
+                Unaligned* to = reinterpret_cast<Unaligned*>(c + static_cast<ptrdiff_t>(r) * c_stride + v * lanes);
+                *to = add ? *to + sum[r][v] : sum[r][v];
+            }
+        return;
+    }
+    float whole[Rows * tile_columns];
+    std::memcpy(whole, sum, sizeof whole);
+    for (int r = 0; r < rows; ++r)
+        for (int j = 0; j < columns; ++j) {
+            float& to = c[static_cast<ptrdiff_t>(r) * c_stride + j];
+            to = add ? to + whole[r * tile_columns + j] : whole[r * tile_columns + j];
+        }
+}
+
+template <class Vector, bool Fused>
+ALWAYS_INLINE float burn_body(int64_t rounds) {
+    Vector sum[burn_chains], a = 0.999f - Vector{}, b = 0.001f - Vector{};
+#pragma GCC unroll 16
+    for (int i = 0; i < burn_chains; ++i) sum[i] = Vector{};
+    for (int64_t round = 0; round < rounds; ++round) {
+#pragma GCC unroll 16
+        for (int i = 0; i < burn_chains; ++i) {
+            if constexpr (Fused)
+                multiply_add<true>(sum[i], a, b);
+            else
+                sum[i] = sum[i] * a + b;
+        }
+#if defined(__x86_64__)
+        asm volatile("" : "+v"(a));  // a might have changed: no product may leave the loop
+#endif
+    }
+    Vector total = sum[0];
+#pragma GCC unroll 16
+    for (int i = 1; i < burn_chains; ++i) total += sum[i];
+    return total[0];
+}
+
+typedef float Float4 __attribute__((vector_size(16)));
+typedef float Float8 __attribute__((vector_size(32)));
+typedef float Float16 __attribute__((vector_size(64)));
+
+// A kernel for each instruction set: the same body, another vector, compiled for its own target.
+#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                               \
+    TARGET inline void tile_##NAME(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, \
+                                   int rows, int columns, bool add) {                                               \
+        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, a, b, b_stride, depth, rows, columns, add);            \
+    }                                                                                                               \
+    TARGET inline float burn_##NAME(int64_t rounds) { return burn_body<VECTOR, FUSED>(rounds); }                    \
+    inline const Kernel kernel_##NAME = {#NAME,                                                                     \
+                                         ROWS,                                                                      \
+                                         VECTORS * static_cast<int>(sizeof(VECTOR) / sizeof(float)),                \
+                                         FUSED,                                                                     \
+                                         [] { return static_cast<bool>(SUPPORTED); },                               \
+                                         tile_##NAME,                                                               \
+                                         burn_##NAME};
+
+#ifdef FUSED_KERNELS
+KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
+KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
+       __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+KERNEL(portable, , Float4, 4, 2, false, true)
+inline const Kernel* const kernels[] = {&kernel_avx512, &kernel_avx2, &kernel_portable};  // best first
+#else
+KERNEL(portable, , Float4, 4, 2, false, true)
+inline const Kernel* const kernels[] = {&kernel_portable};
+#endif
+
+inline double burn_flops(const Kernel& kernel) { return 2.0 * burn_chains * kernel.tile_columns / 2; }
+
+// By name, or the best one that the machine has for "auto". Errors: kernel.unknown, kernel.unsupported.
+inline const Kernel& choose_kernel(const std::string& name) {
+    std::string available;
+    for (const Kernel* kernel : kernels) {
+        if (!kernel->supported()) continue;
+        if (name == "auto" || name == kernel->name) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name;
+    }
+    for (const Kernel* kernel : kernels)
+        if (name == kernel->name)
+            fail("usage.kernel", "this machine cannot run kernel %s; it has: %s", kernel->name, available.c_str());
+    fail("usage.kernel", "unknown kernel \"%s\"; this machine has: %s (or auto)", name.c_str(), available.c_str());
+}
+
+// Scratch floats on cache lines: a vector load that straddles two lines costs two.
+struct alignas(64) Line {
+    float value[16];
+};
+inline size_t lines_for(size_t floats) { return (floats + 15) / 16; }
+
+// Threads, kernel and scratch memory: what every operation below needs in order to run.
+struct Compute {
+    static constexpr int block_tiles = 8;  // tiles of rows of A that a task packs: they stay in a core's second cache
+    const Kernel& kernel;
+    Threads threads;
+    std::vector<Line> packed_b;               // one sum block of B, in panels of tile_columns
+    std::vector<std::vector<Line>> packed_a;  // one per worker
+    Compute(const Kernel& chosen, int thread_count)
+        : kernel(chosen),
+          threads(thread_count),
+          packed_a(static_cast<size_t>(thread_count),
+                   std::vector<Line>(lines_for(static_cast<size_t>(block_tiles * chosen.tile_rows * sum_block)))) {}
+};
+
+// Copies `used` lines of `depth` elements into a panel [depth, width], filling up with zeros; element (k, w) of the
+// panel comes from view(k, w) offset by (first_k, first_w).
+inline void pack_panel(float* panel, View<const float> view, int first_k, int first_w, int depth, int used, int width) {
+    if (!view.transposed) {  // the lines lie side by side: copy along them
+        for (int k = 0; k < depth; ++k) {
+            const float* line = &view(first_k + k, first_w);
+            for (int w = 0; w < used; ++w) panel[k * width + w] = line[w];  // a few dozen: no call to memcpy
+            for (int w = used; w < width; ++w) panel[k * width + w] = 0;
+        }
+        return;
+    }
+    for (int w = 0; w < used; ++w) {
+        const float* line = &view(first_k, first_w + w);
+        for (int k = 0; k < depth; ++k) panel[k * width + w] = line[k];
+    }
+    for (int k = 0; used < width && k < depth; ++k)
+        for (int w = used; w < width; ++w) panel[k * width + w] = 0;
+}
+
+inline int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
+
+// The product of a block of rows with all panels of B, for one sum block.
+inline void matmul_rows(const Kernel& kernel, float* packed_a, View<float> c, View<const float> a, View<const float> b,
+                        const float* packed_b, int first_row, int rows, int first_column, int end_column, int first_k,
+                        int depth, bool add) {
+    const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
+    for (int i = 0; i < rows; i += kernel.tile_rows)
+        pack_panel(packed_a + i * depth, a_lines, first_k, first_row + i, depth, std::min(kernel.tile_rows, rows - i),
+                   kernel.tile_rows);
+    for (int j = first_column; j < end_column; j += kernel.tile_columns) {
+        const float* panel = packed_b ? packed_b + static_cast<ptrdiff_t>(j) * depth : &b(first_k, j);
+        const int panel_stride = packed_b ? kernel.tile_columns : b.stride;
+        for (int i = 0; i < rows; i += kernel.tile_rows)
+            kernel.tile(&c(first_row + i, j), c.stride, packed_a + i * depth, panel, panel_stride, depth,
+                        std::min(kernel.tile_rows, rows - i), std::min(kernel.tile_columns, end_column - j), add);
+    }
+}
+
+// The fast version of matmul_plain: same definition, panels packed for the kernel's tiles. A few rows (acting) read B
+// where it lies: packing it would cost as much as the product.
+inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
+                   Store store) {
+    if (M == 0 || N == 0) return;
+    if (K == 0) {  // an empty sum
+        for (int i = 0; store == Store::overwrite && i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
+        return;
+    }
+    const Kernel& kernel = compute.kernel;
+    const bool pack_b = M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
+    const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
+    const int threads = serial ? 1 : compute.threads.count();
+    // Tasks: blocks of rows; for a wide C and few rows, also of columns. Small enough for a fair share, no smaller.
+    const int block_rows = std::min(Compute::block_tiles * kernel.tile_rows, round_up((M + 3) / 4, kernel.tile_rows));
+    const int row_blocks = (M + block_rows - 1) / block_rows;
+    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, N / (4 * kernel.tile_columns)));
+    const int block_columns = round_up((N + column_blocks - 1) / column_blocks, kernel.tile_columns);
+    if (pack_b) {
+        const size_t lines = lines_for(static_cast<size_t>(round_up(N, kernel.tile_columns)) * sum_block);
+        if (compute.packed_b.size() < lines) compute.packed_b.resize(lines);
+    }
+    float* const packed_b = pack_b ? compute.packed_b[0].value : nullptr;
+    const auto share_out = [&](int tasks, auto&& body) {
+        if (threads == 1)
+            for (int task = 0; task < tasks; ++task) body(task, 0);
+        else
+            compute.threads.run(tasks, body);
+    };
+    for (int first_k = 0; first_k < K; first_k += sum_block) {
+        const int depth = std::min(sum_block, K - first_k);
+        const int panels = (N + kernel.tile_columns - 1) / kernel.tile_columns;
+        const int panels_a_task = threads == 1 ? panels : std::max(1, panels / 8);
+        if (pack_b)
+            share_out((panels + panels_a_task - 1) / panels_a_task, [&](int task, int) {
+                for (int p = task * panels_a_task; p < std::min(panels, (task + 1) * panels_a_task); ++p)
+                    pack_panel(packed_b + static_cast<ptrdiff_t>(p) * kernel.tile_columns * depth, b, first_k,
+                               p * kernel.tile_columns, depth,
+                               std::min(kernel.tile_columns, N - p * kernel.tile_columns), kernel.tile_columns);
+            });
+        share_out(row_blocks * column_blocks, [&](int task, int worker) {
+            const int first_row = task / column_blocks * block_rows,
+                      first_column = task % column_blocks * block_columns;
+            matmul_rows(kernel, compute.packed_a[static_cast<size_t>(worker)][0].value, c, a, b, packed_b, first_row,
+                        std::min(block_rows, M - first_row), first_column, std::min(N, first_column + block_columns),
+                        first_k, depth, first_k > 0 || store == Store::accumulate);
+        });
+    }
+}
+
+// In double, for the gradient checks, the plain version is all there is.
+inline void matmul(Compute&, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
+                   Store store) {
+    matmul_plain(c, a, b, M, N, K, store);
+}
+
+// Sum of a[i] * b[i] in 16 lanes, folded in a fixed tree; faster than one chain of additions, and as reproducible.
+template <class T>
+T dot(const T* a, const T* b, int n) {
+    typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
+    typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
+    Lanes sum = {};
+    int i = 0;
+    for (; i + 16 <= n; i += 16)
+        sum += *reinterpret_cast<const Unaligned*>(a + i) * *reinterpret_cast<const Unaligned*>(b + i);
+    const auto eight = __builtin_shufflevector(sum, sum, 0, 1, 2, 3, 4, 5, 6, 7) +
+                       __builtin_shufflevector(sum, sum, 8, 9, 10, 11, 12, 13, 14, 15);
+    const auto four = __builtin_shufflevector(eight, eight, 0, 1, 2, 3) + __builtin_shufflevector(eight, eight, 4, 5, 6, 7);
+    T rest = 0;
+    for (; i < n; ++i) rest += a[i] * b[i];
+    return ((four[0] + four[2]) + (four[1] + four[3])) + rest;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Tensors and the tape. Templated on the scalar: float trains, double serves the checks against finite differences.
+
+// Two-dimensional, row-major. `gradient` is null where no gradient is wanted (inputs, acting).
+template <class T>
+struct Tensor {
+    T* value = nullptr;     // [rows, columns]
+    T* gradient = nullptr;  // [rows, columns], accumulated
+    int rows = 0, columns = 0;
+    size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
+};
+
+// Memory that is handed out in pieces and taken back all at once; after the first batch of a shape nothing is
+// allocated.
+class Arena {
+  public:
+    // `bytes` bytes aligned to 64, not initialised, valid until reset().
+    void* take(size_t bytes) {
+        bytes = (bytes + 63) / 64 * 64;
+        while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) ++chunk_, used_ = 0;
+        if (chunk_ == chunks_.size()) {
+            const size_t size = std::max(bytes, size_t{1} << 20);
+            chunks_.push_back({std::unique_ptr<char[], Release>(new (std::align_val_t{64}) char[size]), size});
+        }
+        used_ += bytes;
+        return chunks_[chunk_].data.get() + used_ - bytes;
+    }
+    void reset() { chunk_ = used_ = 0; }
+
+  private:
+    struct Release {
+        void operator()(char* data) const { operator delete[](data, std::align_val_t{64}); }
+    };
+    struct Chunk {
+        std::unique_ptr<char[], Release> data;
+        size_t bytes;
+    };
+    std::vector<Chunk> chunks_;
+    size_t chunk_ = 0, used_ = 0;
+};
+
+// Records each operation's backward step and replays them in reverse. Gradients are added to, never overwritten, so a
+// tensor may be used any number of times.
+template <class T>
+struct Tape {
+    Compute& compute;
+    bool recording = true;  // false: acting; no gradients, no dropout
+    Random dropout_random{0, Stream::dropout};
+    uint64_t dropout_step = 0;  // the update: a fresh mask for each
+
+    explicit Tape(Compute& c) : compute(c) {}
+
+    // A result; its gradient, if recorded, starts at zero.
+    Tensor<T> make(int rows, int columns) {
+        Tensor<T> x = {nullptr, nullptr, rows, columns};
+        x.value = scratch<T>(x.size());
+        if (recording) {
+            x.gradient = scratch<T>(x.size());
+            std::fill_n(x.gradient, x.size(), T(0));
+        }
+        return x;
+    }
+
+    // An input: copied, without gradient.
+    Tensor<T> constant(const float* data, int rows, int columns) {
+        Tensor<T> x = {nullptr, nullptr, rows, columns};
+        x.value = scratch<T>(x.size());
+        std::copy_n(data, x.size(), x.value);
+        return x;
+    }
+
+    template <class Element>
+    Element* scratch(size_t count) {
+        return static_cast<Element*>(arena_.take(count * sizeof(Element)));
+    }
+
+    // Keeps `step` for backward(). It is copied into the arena, so it may hold views and numbers only.
+    template <class Step>
+    void on_backward(Step step) {
+        static_assert(std::is_trivially_destructible_v<Step>);
+        if (!recording) return;
+        steps_.push_back({[](void* s) { (*static_cast<Step*>(s))(); }, new (arena_.take(sizeof(Step))) Step(step)});
+    }
+
+    // d(loss)/d(everything recorded), for a loss [1, 1].
+    void backward(Tensor<T> loss) {
+        loss.gradient[0] = 1;
+        for (size_t i = steps_.size(); i-- > 0;) steps_[i].call(steps_[i].step);
+    }
+
+    // Forgets all tensors made so far.
+    void reset() {
+        steps_.clear();
+        arena_.reset();
+    }
+
+  private:
+    struct Step {
+        void (*call)(void*);
+        void* step;
+    };
+    Arena arena_;
+    std::vector<Step> steps_;
+};
+
+// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
+// row.
+template <class F>
+void for_rows(Compute& compute, int rows, int work, F&& f) {
+    const int block = std::max(1, std::min((rows + 7) / 8, 1 + 100000 / std::max(1, work)));
+    if (static_cast<double>(rows) * work < 2e4) return f(0, rows);
+    compute.threads.run((rows + block - 1) / block,
+                        [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); });
+}
+
+// to[j] += sum over rows of from[row, j]: each column alone, in order of rows.
+template <class T>
+void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns) {
+    const auto sum = [=](int begin, int end) {
+        for (int row = 0; row < rows; ++row)
+            for (int j = begin; j < end; ++j) to[j] += from[static_cast<ptrdiff_t>(row) * columns + j];
+    };
+    const int blocks = (columns + 63) / 64;
+    for_rows(compute, blocks, rows * 64, [&](int begin, int end) { sum(begin * 64, std::min(columns, end * 64)); });
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Operations, in the order in which the network uses them; each backward stands right below its forward.
+
+// PyTorch keeps a Linear's weight as [out, in] and GPT-2's "Conv1D" as [in, out]; so do we, for the sake of
+// checkpoints.
+enum class Layout { out_in, in_out };
+
+template <class T>
+struct Affine {
+    Tensor<T> weight;  // [out, in] or [in, out]
+    Tensor<T> bias;    // [1, out]
+    Layout layout;
+};
+
+// x [n, in] -> x W + b, columns [first, first + count) of it: y [n, count].
+template <class T>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count) {
+    const Tensor<T> w = affine.weight, bias = affine.bias;
+    const bool transposed = affine.layout == Layout::out_in;
+    const ptrdiff_t offset = transposed ? static_cast<ptrdiff_t>(first) * w.columns : first;
+    const Tensor<T> y = tape.make(x.rows, count);
+    Compute& compute = tape.compute;
+    for (ptrdiff_t row = 0; row < y.rows; ++row)
+        for (int j = 0; j < count; ++j) y.value[row * count + j] = bias.value[first + j];
+    matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed}, x.rows,
+           count, x.columns, Store::accumulate);
+    tape.on_backward([=, &compute] {
+        const View<const T> dy = {y.gradient, count};
+        if (x.gradient)  // dx += dy W^T
+            matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
+                   x.columns, count, Store::accumulate);
+        if (transposed)  // dW^T += dy^T x
+            matmul(compute, View<T>{w.gradient + offset, w.columns}, {y.gradient, count, true}, {x.value, x.columns},
+                   count, x.columns, x.rows, Store::accumulate);
+        else  // dW += x^T dy
+            matmul(compute, View<T>{w.gradient + offset, w.columns}, {x.value, x.columns, true}, dy, x.columns, count,
+                   x.rows, Store::accumulate);
+        add_column_sums(compute, bias.gradient + first, y.gradient, y.rows, count);
+    });
+    return y;
+}
+
+template <class T>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine) {
+    return linear(tape, x, affine, 0, affine.bias.columns);
+}
+
+// y [rows.size(), d] = the named rows of x [n, d]; a row may be named once at most.
+template <class T>
+Tensor<T> select_rows(Tape<T>& tape, Tensor<T> x, const int* rows, int count) {
+    const Tensor<T> y = tape.make(count, x.columns);
+    const size_t d = static_cast<size_t>(x.columns);
+    for (int i = 0; i < count; ++i)
+        std::copy_n(x.value + static_cast<size_t>(rows[i]) * d, d, y.value + static_cast<size_t>(i) * d);
+    tape.on_backward([=] {
+        for (size_t i = 0; i < static_cast<size_t>(count); ++i)
+            for (size_t j = 0; j < d; ++j) x.gradient[static_cast<size_t>(rows[i]) * d + j] += y.gradient[i * d + j];
+    });
+    return y;
+}
+
+template <class T>
+struct Norm {
+    Tensor<T> weight, bias;  // [1, d]
+};
+
+// LayerNorm over the columns of x [n, d]: y = (x - mean) / sqrt(variance + 1e-5) * weight + bias, variance with 1/d.
+template <class T>
+Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
+    const int d = x.columns;
+    const Tensor<T> y = tape.make(x.rows, d), weight = norm.weight, bias = norm.bias;
+    T* normalised = tape.template scratch<T>(x.size());                    // [n, d] (x - mean) / deviation
+    T* deviation = tape.template scratch<T>(static_cast<size_t>(x.rows));  // [n]
+    T* ones = tape.template scratch<T>(static_cast<size_t>(d));            // [d]
+    std::fill_n(ones, d, T(1));
+    Compute& compute = tape.compute;
+    for_rows(compute, x.rows, 8 * d, [=](int begin, int end) {
+        for (ptrdiff_t row = begin; row < end; ++row) {
+            const T* in = x.value + row * d;
+            T *centred = normalised + row * d, *out = y.value + row * d;
+            const T mean = dot(in, ones, d) / T(d);
+            for (int j = 0; j < d; ++j) centred[j] = in[j] - mean;
+            deviation[row] = std::sqrt(dot(centred, centred, d) / T(d) + T(1e-5));
+            for (int j = 0; j < d; ++j) {
+                centred[j] /= deviation[row];
+                out[j] = centred[j] * weight.value[j] + bias.value[j];
+            }
+        }
+    });
+    tape.on_backward([=, &compute] {
+        // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
+        T* g_all = y.value;  // the output is not needed any more: its memory serves
+        for_rows(compute, x.rows, 10 * d, [=](int begin, int end) {
+            for (ptrdiff_t row = begin; row < end; ++row) {
+                const T *dy = y.gradient + row * d, *n = normalised + row * d;
+                T *g = g_all + row * d, *dx = x.gradient + row * d;
+                for (int j = 0; j < d; ++j) g[j] = dy[j] * weight.value[j];
+                const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
+                for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
+                for (int j = 0; j < d; ++j) g[j] = dy[j] * n[j];
+            }
+        });
+        add_column_sums(compute, weight.gradient, g_all, x.rows, d);
+        add_column_sums(compute, bias.gradient, y.gradient, x.rows, d);
+    });
+    return y;
+}
+
+// Inverted dropout's factors for elements [begin, end) of one place in the network: 0 with probability p, 1 / (1 - p)
+// else. They come from the counter (update, place, element), so backward makes them again instead of storing them.
+struct Dropout {
+    Random random;
+    uint64_t step;
+    uint32_t site;
+    float probability;
+
+    // f(element, factor) for each element in [begin, end).
+    template <class T, class F>
+    void each(size_t begin, size_t end, F&& f) const {
+        if (probability == 0) {
+            for (size_t i = begin; i < end; ++i) f(i, T(1));
+            return;
+        }
+        const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
+        const T keep = T(1) / (T(1) - T(probability));
+        for (size_t block = begin / 4; block * 4 < end; ++block) {
+            const Words4 words = random.words(step, static_cast<uint32_t>(block), site);
+            const size_t first = std::max(begin, block * 4), last = std::min(end, block * 4 + 4);
+            if (last - first == 4)
+                for (size_t i = 0; i < 4; ++i) f(first + i, words[i] < threshold ? T(0) : keep);
+            else
+                for (size_t i = first; i < last; ++i) f(i, words[i % 4] < threshold ? T(0) : keep);
+        }
+    }
+};
+
+template <class T>
+Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
+    return {tape.dropout_random, tape.dropout_step, site, tape.recording ? probability : 0.0f};
+}
+
+// y = residual + dropout(x), or dropout(x) if residual is empty; all [n, d].
+template <class T>
+Tensor<T> add_dropout(Tape<T>& tape, Tensor<T> residual, Tensor<T> x, Dropout dropout) {
+    const Tensor<T> y = tape.make(x.rows, x.columns);
+    const size_t d = static_cast<size_t>(x.columns);
+    Compute& compute = tape.compute;
+    for_rows(compute, x.rows, 16 * x.columns, [=](int begin, int end) {
+        dropout.each<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, [=](size_t i, T factor) {
+            y.value[i] = (residual.value ? residual.value[i] : T(0)) + factor * x.value[i];
+        });
+    });
+    tape.on_backward([=, &compute] {
+        for_rows(compute, x.rows, 16 * x.columns, [=](int begin, int end) {
+            dropout.each<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, [=](size_t i, T factor) {
+                if (residual.value) residual.gradient[i] += y.gradient[i];
+                x.gradient[i] += factor * y.gradient[i];
+            });
+        });
+    });
+    return y;
+}
+
+// x [n, d] = max(x, 0), in place: the product before needs its output no more. The slope at 0 is 0, as in PyTorch.
+template <class T>
+void relu(Tape<T>& tape, Tensor<T> x) {
+    Compute& compute = tape.compute;
+    const ptrdiff_t d = x.columns;
+    for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
+        for (ptrdiff_t i = begin * d; i < end * d; ++i) x.value[i] = x.value[i] > 0 ? x.value[i] : T(0);
+    });
+    tape.on_backward([=, &compute] {
+        for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
+            for (ptrdiff_t i = begin * d; i < end * d; ++i) x.gradient[i] = x.value[i] > 0 ? x.gradient[i] : T(0);
+        });
+    });
+}
+
+// Causal attention, plain, one head: out [n, d] = softmax over keys j <= i of (q_i . k_j / sqrt(d)), times v_j.
+// q, k, v [n, d] of one sequence. The specification; `attention` below is held to it.
+template <class T>
+void attention_plain(T* out, const T* q, const T* k, const T* v, int n, int d) {
+    std::vector<T> weight(static_cast<size_t>(n));
+    for (int i = 0; i < n; ++i) {
+        T total = 0;
+        for (int j = 0; j <= i; ++j) {
+            T score = 0;
+            for (int c = 0; c < d; ++c) score += q[i * d + c] * k[j * d + c];
+            weight[static_cast<size_t>(j)] = std::exp(score / std::sqrt(T(d)));
+            total += weight[static_cast<size_t>(j)];
+        }
+        for (int c = 0; c < d; ++c) {
+            out[i * d + c] = 0;
+            for (int j = 0; j <= i; ++j) out[i * d + c] += weight[static_cast<size_t>(j)] / total * v[j * d + c];
+        }
+    }
+}
+
+// How a packed batch of token sequences lies in memory, and which of its tokens ask.
+struct Span {
+    int first_token, tokens;   // the sequence's rows of k and v
+    int first_query, queries;  // its rows of q
+};
+
+template <class T>
+void softmax(T* x, int n) {
+    T largest = x[0], total = 0;
+    for (int i = 1; i < n; ++i) largest = std::max(largest, x[i]);
+    for (int i = 0; i < n; ++i) total += x[i] = std::exp(x[i] - largest);
+    for (int i = 0; i < n; ++i) x[i] /= total;
+}
+
+// Causal attention with `heads` heads, dropout on the weights, on packed sequences.
+// q [queries, d]; kv [tokens, 2 d]: keys, then values; head h has columns h d/heads onwards. Query i stands at token
+// position[i] of the whole batch and sees its own sequence up to and with itself. Returns [queries, d].
+template <class T>
+Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans, int span_count, const int* position,
+                    int heads, Dropout dropout) {
+    const int d = q.columns, size = d / heads;
+    const T scale = T(1) / std::sqrt(T(size));
+    const Tensor<T> out = tape.make(q.rows, d);
+    int longest = 1;
+    for (int s = 0; s < span_count; ++s) longest = std::max(longest, spans[s].tokens);
+    const size_t row = static_cast<size_t>(longest);
+    T* weights = tape.template scratch<T>(static_cast<size_t>(q.rows * heads) * row);  // [queries, heads, longest]
+    Compute& compute = tape.compute;
+    const int work = 1 + 4 * longest * d * std::max(1, q.rows / std::max(1, span_count));
+    for_rows(compute, span_count, work, [=](int begin, int end) {
+        for (int s = begin; s < end; ++s)
+            for (int i = spans[s].first_query; i < spans[s].first_query + spans[s].queries; ++i)
+                for (int h = 0; h < heads; ++h) {
+                    const int seen = position[i] - spans[s].first_token + 1;
+                    const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
+                    T *w = weights + first_weight, *o = out.value + static_cast<ptrdiff_t>(i) * d + h * size;
+                    const T* query = q.value + static_cast<ptrdiff_t>(i) * d + h * size;
+                    const T *key = kv.value + static_cast<ptrdiff_t>(spans[s].first_token) * 2 * d + h * size,
+                            *v = key + d;
+                    for (int j = 0; j < seen; ++j)
+                        w[j] = dot(query, key + static_cast<ptrdiff_t>(j) * 2 * d, size) * scale;
+                    softmax(w, seen);
+                    std::fill_n(o, size, T(0));
+                    dropout.each<T>(
+                        first_weight, first_weight + static_cast<size_t>(seen), [=](size_t element, T factor) {
+                            const size_t j = element - first_weight;
+                            for (int c = 0; c < size; ++c)
+                                o[c] += factor * w[j] * v[j * static_cast<size_t>(2 * d) + static_cast<size_t>(c)];
+                        });
+                }
+    });
+    T* d_weights = tape.template scratch<T>(tape.recording ? static_cast<size_t>(q.rows * heads) * row : 0);
+    tape.on_backward([=, &compute] {
+        for_rows(compute, span_count, 2 * work, [=](int begin, int end) {
+            for (int s = begin; s < end; ++s)
+                for (int i = spans[s].first_query; i < spans[s].first_query + spans[s].queries; ++i)
+                    for (int h = 0; h < heads; ++h) {
+                        const int seen = position[i] - spans[s].first_token + 1;
+                        const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
+                        const ptrdiff_t at = static_cast<ptrdiff_t>(i) * d + h * size;
+                        const ptrdiff_t first_key = static_cast<ptrdiff_t>(spans[s].first_token) * 2 * d + h * size;
+                        const T *w = weights + first_weight, *query = q.value + at, *d_out = out.gradient + at;
+                        T *dw = d_weights + first_weight, *d_query = q.gradient + at;
+                        // d_v_j += factor_j w_j d_out;  dw_j = factor_j v_j . d_out
+                        dropout.each<T>(first_weight, first_weight + static_cast<size_t>(seen),
+                                        [=](size_t element, T factor) {
+                                            const ptrdiff_t j = static_cast<ptrdiff_t>(element - first_weight);
+                                            const ptrdiff_t value = first_key + j * 2 * d + d;
+                                            dw[j] = factor * dot(kv.value + value, d_out, size);
+                                            for (int c = 0; c < size; ++c)
+                                                kv.gradient[value + c] += factor * w[j] * d_out[c];
+                                        });
+                        // Through the softmax: d_score_j = w_j (dw_j - sum_m w_m dw_m).
+                        const T mean = dot(w, dw, seen);
+                        for (int j = 0; j < seen; ++j) {
+                            const T d_score = w[j] * (dw[j] - mean) * scale;
+                            const ptrdiff_t key = first_key + static_cast<ptrdiff_t>(j) * 2 * d;
+                            for (int c = 0; c < size; ++c) {
+                                d_query[c] += d_score * kv.value[key + c];
+                                kv.gradient[key + c] += d_score * query[c];
+                            }
+                        }
+                    }
+        });
+    });
+    return out;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Parameters by name, and how each kind starts.
+
+enum class Init {
+    zeros,
+    ones,
+    normal_002,      // N(0, 0.02^2): weights inside the GPT-2 stack
+    normal_1,        // N(0, 1): position table
+    uniform_fan_in,  // uniform in +-1/sqrt(fan in): PyTorch's default for a Linear's weight and bias
+    orthogonal,      // orthonormal rows: the policy's output layers
+};
+
+template <class T>
+struct Parameter {
+    std::string name;             // ODT's name in its state_dict
+    std::vector<uint64_t> shape;  // as saved
+    std::vector<T> value, gradient;
+    Tensor<T> tensor() { return {value.data(), gradient.data(), rows(), static_cast<int>(shape.back())}; }
+    int rows() const { return shape.size() == 1 ? 1 : static_cast<int>(shape[0]); }
+};
+
+// Makes rows [rows, columns], rows <= columns, of independent normals orthonormal (Gram-Schmidt): a random rotation.
+inline void orthonormalise(std::vector<double>& x, int rows, int columns) {
+    for (int i = 0; i < rows; ++i) {
+        double* row = x.data() + static_cast<ptrdiff_t>(i) * columns;
+        for (int j = 0; j < i; ++j) {
+            const double* other = x.data() + static_cast<ptrdiff_t>(j) * columns;
+            const double along = dot(row, other, columns);
+            for (int c = 0; c < columns; ++c) row[c] -= along * other[c];
+        }
+        const double norm = std::sqrt(dot(row, row, columns));
+        for (int c = 0; c < columns; ++c) row[c] /= norm;
+    }
+}
+
+// Start values from Stream::initialisation (step: number of the tensor, index: element).
+template <class T>
+void initialise(Parameter<T>& parameter, Init init, int fan_in, uint32_t seed, uint64_t number) {
+    const Random random = {seed, Stream::initialisation};
+    const size_t n = parameter.value.size();
+    std::vector<double> x(n);
+    for (uint32_t i = 0; i < n; ++i) {
+        if (init == Init::ones) x[i] = 1;
+        if (init == Init::normal_002) x[i] = 0.02 * random.normal(number, i);
+        if (init == Init::normal_1 || init == Init::orthogonal) x[i] = random.normal(number, i);
+        if (init == Init::uniform_fan_in) x[i] = (2 * random.uniform(number, i) - 1) / std::sqrt(fan_in);
+    }
+    if (init == Init::orthogonal) orthonormalise(x, parameter.rows(), static_cast<int>(parameter.shape.back()));
+    for (size_t i = 0; i < n; ++i) parameter.value[i] = static_cast<T>(x[i]);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The decision transformer: GPT-2 blocks over the tokens R_1 s_1 a_1 R_2 s_2 a_2 ... of each window.
+// DT sec. 3, ODT sec. 3. Sequences are packed, never padded, and only what the action prediction needs is computed: the
+// last action of a window is never a token, and in the last layer only the asking state tokens go on after attention.
+
+enum class Head { squashed_gaussian, categorical, deterministic };
+
+struct TransformerConfig {
+    int state_dim, action_dim;  // widths of the state and action tokens' inputs; action_dim is also the heads' width
+    int layers, heads, width;
+    int max_timesteps;  // rows of the table of absolute positions; 0: no positions (ODT's "ordering" 0)
+    float dropout;
+    Head head;
+};
+
+// Windows of a batch, one after the other. n steps in all.
+struct SequenceBatch {
+    std::vector<int> lengths;          // [windows] steps of each, >= 1
+    std::vector<float> returns_to_go;  // [n] scaled
+    std::vector<float> states;         // [n, state_dim] normalised
+    std::vector<float> actions;        // [n, action_dim]; those of each window's last step are not read
+    std::vector<int> timesteps;        // [n]
+    int steps() const { return static_cast<int>(returns_to_go.size()); }
+};
+
+enum class Ask { every_state, last_state };  // training learns from every step of a window; acting wants the last
+
+template <class T>
+struct Policy {
+    Tensor<T> mean;     // [asked, action_dim]; categorical: log-probabilities; deterministic: the action itself
+    Tensor<T> log_std;  // [asked, action_dim] in [-5, 2]; squashed Gaussian only
+};
+
+template <class T>
+struct Transformer {
+    struct Block {
+        Norm<T> ln_1;
+        Affine<T> c_attn, attn_proj;  // c_attn: columns q, k, v in this order
+        Norm<T> ln_2;
+        Affine<T> c_fc, mlp_proj;
+    };
+    TransformerConfig config;
+    std::vector<Parameter<T>> parameters;  // in the order of construction
+    Affine<T> embed_return, embed_state, embed_action;
+    Tensor<T> embed_ordering;  // [max_timesteps, width]
+    Norm<T> embed_ln;
+    std::vector<Block> blocks;
+    Norm<T> ln_f;
+    Affine<T> predict_mean, predict_log_std;
+
+    Transformer(const TransformerConfig& c, uint32_t seed) : config(c) {
+        const int d = c.width;
+        if (c.layers < 1 || c.heads < 1 || d < 1 || d % c.heads != 0)
+            fail("nn.config",
+                 "a transformer of width %d cannot have %d heads in %d layers: the width must be a multiple of the "
+                 "heads, and there must be at least one of each",
+                 d, c.heads, c.layers);
+        embed_return = linear_layer("embed_return", 1, d, Init::uniform_fan_in, seed);
+        embed_state = linear_layer("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
+        embed_action = linear_layer("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);
+        if (c.max_timesteps > 0)
+            embed_ordering = add("embed_ordering.weight", {c.max_timesteps, d}, Init::normal_1, 0, seed);
+        embed_ln = norm("embed_ln", seed);
+        for (int layer = 0; layer < c.layers; ++layer) {
+            const std::string h = "transformer.h." + std::to_string(layer) + ".";
+            Block block;
+            block.ln_1 = norm(h + "ln_1", seed);
+            block.c_attn = conv1d(h + "attn.c_attn", d, 3 * d, seed);
+            block.attn_proj = conv1d(h + "attn.c_proj", d, d, seed);
+            block.ln_2 = norm(h + "ln_2", seed);
+            block.c_fc = conv1d(h + "mlp.c_fc", d, 4 * d, seed);
+            block.mlp_proj = conv1d(h + "mlp.c_proj", 4 * d, d, seed);
+            blocks.push_back(block);
+        }
+        ln_f = norm("transformer.ln_f", seed);
+        if (c.head == Head::squashed_gaussian) {
+            predict_mean = linear_layer("predict_action.mu", d, c.action_dim, Init::orthogonal, seed);
+            predict_log_std = linear_layer("predict_action.log_std", d, c.action_dim, Init::orthogonal, seed);
+        } else if (c.head == Head::categorical) {
+            predict_mean = linear_layer("predict_action.logits", d, c.action_dim, Init::orthogonal, seed);
+        } else {
+            predict_mean = linear_layer("predict_action.0", d, c.action_dim, Init::uniform_fan_in, seed);
+        }
+    }
+    Transformer(const Transformer&) = delete;
+    Transformer& operator=(const Transformer&) = delete;
+
+  private:
+    Tensor<T> add(const std::string& name, const std::vector<int>& shape, Init init, int fan_in, uint32_t seed) {
+        Parameter<T> parameter;
+        parameter.name = name;
+        parameter.shape.assign(shape.begin(), shape.end());
+        size_t size = 1;
+        for (int extent : shape) size *= static_cast<size_t>(extent);
+        parameter.value.resize(size);
+        parameter.gradient.resize(size);
+        initialise(parameter, init, fan_in, seed, parameters.size());
+        parameters.push_back(std::move(parameter));  // moving a vector keeps its memory: tensors stay valid
+        return parameters.back().tensor();
+    }
+    Affine<T> linear_layer(const std::string& name, int in, int out, Init init, uint32_t seed) {
+        const Tensor<T> weight = add(name + ".weight", {out, in}, init, in, seed);
+        const Init bias = init == Init::orthogonal ? Init::zeros : init;
+        return {weight, add(name + ".bias", {out}, bias, in, seed), Layout::out_in};
+    }
+    Affine<T> conv1d(const std::string& name, int in, int out, uint32_t seed) {
+        const Tensor<T> weight = add(name + ".weight", {in, out}, Init::normal_002, in, seed);
+        return {weight, add(name + ".bias", {out}, Init::zeros, in, seed), Layout::in_out};
+    }
+    Norm<T> norm(const std::string& name, uint32_t seed) {
+        const Tensor<T> weight = add(name + ".weight", {config.width}, Init::ones, 0, seed);
+        return {weight, add(name + ".bias", {config.width}, Init::zeros, 0, seed)};
+    }
+};
+
+// Where each token of a packed batch lies.
+struct TokenLayout {
+    int tokens = 0;
+    std::vector<Span> all, asked;          // a span per window; queries: all its tokens, or the asking ones
+    std::vector<int> every_token, asking;  // token rows that ask, in all layers but the last, and in the last
+    std::vector<int> step_token;           // [n] row of a step's R token; s and a follow
+};
+
+inline TokenLayout token_layout(const SequenceBatch& batch, Ask ask) {
+    TokenLayout layout;
+    for (const int length : batch.lengths) {
+        const int tokens = 3 * length - 1, first_asking = static_cast<int>(layout.asking.size());
+        for (int c = 0; c < length; ++c) {
+            layout.step_token.push_back(layout.tokens + 3 * c);
+            if (ask == Ask::every_state || c == length - 1) layout.asking.push_back(layout.tokens + 3 * c + 1);
+        }
+        layout.all.push_back({layout.tokens, tokens, layout.tokens, tokens});
+        layout.asked.push_back(
+            {layout.tokens, tokens, first_asking, static_cast<int>(layout.asking.size()) - first_asking});
+        for (int i = 0; i < tokens; ++i) layout.every_token.push_back(layout.tokens + i);
+        layout.tokens += tokens;
+    }
+    return layout;
+}
+
+// An array that the tape keeps until it is reset, as its steps need it.
+template <class T, class Element>
+const Element* keep(Tape<T>& tape, const std::vector<Element>& x) {
+    return static_cast<const Element*>(
+        std::memcpy(tape.template scratch<Element>(x.size() + 1), x.data(), x.size() * sizeof(Element)));
+}
+
+// to[rows[i]] = from[i] + table[index[i]] for each i; both ways. An empty table adds nothing.
+template <class T>
+void place_tokens(Tape<T>& tape, Tensor<T> to, const std::vector<int>& rows, Tensor<T> from, Tensor<T> table,
+                  const std::vector<int>& index) {
+    const int *row = keep(tape, rows), *at = keep(tape, index);
+    const ptrdiff_t d = to.columns;
+    for (ptrdiff_t i = 0; i < from.rows; ++i)
+        for (ptrdiff_t j = 0; j < d; ++j)
+            to.value[row[i] * d + j] = from.value[i * d + j] + (table.value ? table.value[at[i] * d + j] : T(0));
+    tape.on_backward([=] {
+        for (ptrdiff_t i = 0; i < from.rows; ++i)
+            for (ptrdiff_t j = 0; j < d; ++j) {
+                from.gradient[i * d + j] += to.gradient[row[i] * d + j];
+                if (table.value) table.gradient[at[i] * d + j] += to.gradient[row[i] * d + j];
+            }
+    });
+}
+
+// The tokens R, s, a of every step, each through its own linear layer, plus the position's row: [tokens, width].
+template <class T>
+Tensor<T> embed_tokens(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch,
+                       const TokenLayout& layout) {
+    const TransformerConfig& config = model.config;
+    const int n = batch.steps();
+    const Tensor<T> tokens = tape.make(layout.tokens, config.width);
+    std::vector<int> rows = layout.step_token, position(static_cast<size_t>(n), 0);
+    for (size_t i = 0; config.max_timesteps > 0 && i < position.size(); ++i)
+        position[i] = std::min(batch.timesteps[i], config.max_timesteps - 1);  // ODT clips at the end of its table
+    place_tokens(tape, tokens, rows, linear(tape, tape.constant(batch.returns_to_go.data(), n, 1), model.embed_return),
+                 model.embed_ordering, position);
+    for (int& row : rows) ++row;
+    place_tokens(tape, tokens, rows,
+                 linear(tape, tape.constant(batch.states.data(), n, config.state_dim), model.embed_state),
+                 model.embed_ordering, position);
+    std::vector<int> action_rows, action_position;
+    std::vector<float> actions;
+    for (size_t window = 0, step = 0; window < batch.lengths.size(); ++window, ++step)
+        for (int c = 0; c + 1 < batch.lengths[window]; ++c, ++step) {
+            const auto first = batch.actions.begin() + static_cast<ptrdiff_t>(step) * config.action_dim;
+            actions.insert(actions.end(), first, first + config.action_dim);
+            action_rows.push_back(rows[step] + 1);
+            action_position.push_back(position[step]);
+        }
+    const int action_count = static_cast<int>(action_rows.size());
+    if (action_count > 0)
+        place_tokens(tape, tokens, action_rows,
+                     linear(tape, tape.constant(actions.data(), action_count, config.action_dim), model.embed_action),
+                     model.embed_ordering, action_position);
+    return tokens;
+}
+
+// Dropout's places: 0 after the embedding's LayerNorm, then three a layer.
+inline uint32_t dropout_site(int layer, int place) { return static_cast<uint32_t>(1 + 3 * layer + place); }
+
+// One pre-LN block: x + attention(LN(x)), then + MLP(LN(.)). x [tokens, d] -> [spans' queries, d] for the rows that
+// ask.
+template <class T>
+Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int layer, Tensor<T> x,
+                            const std::vector<Span>& spans, const std::vector<int>& asking) {
+    const typename Transformer<T>::Block& block = model.blocks[static_cast<size_t>(layer)];
+    const int d = model.config.width, asked = static_cast<int>(asking.size());
+    const float p = model.config.dropout;
+    const bool all_ask = asked == x.rows;
+    const int* rows = keep(tape, asking);
+    const Tensor<T> h = layer_norm(tape, x, block.ln_1);
+    const Tensor<T> q = linear(tape, all_ask ? h : select_rows(tape, h, rows, asked), block.c_attn, 0, d);
+    const Tensor<T> kv = linear(tape, h, block.c_attn, d, 2 * d);
+    const Tensor<T> a = attention(tape, q, kv, keep(tape, spans), static_cast<int>(spans.size()), rows,
+                                  model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
+    const Tensor<T> x1 = add_dropout(tape, all_ask ? x : select_rows(tape, x, rows, asked),
+                                     linear(tape, a, block.attn_proj), dropout_at(tape, dropout_site(layer, 1), p));
+    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc);
+    relu(tape, hidden);
+    return add_dropout(tape, x1, linear(tape, hidden, block.mlp_proj), dropout_at(tape, dropout_site(layer, 2), p));
+}
+
+// y = -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
+template <class T>
+Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
+    const Tensor<T> y = tape.make(x.rows, x.columns);
+    for (size_t i = 0; i < x.size(); ++i) y.value[i] = T(-5) + T(3.5) * (std::tanh(x.value[i]) + T(1));
+    tape.on_backward([=] {
+        for (size_t i = 0; i < x.size(); ++i) {
+            const T t = std::tanh(x.value[i]);
+            x.gradient[i] += T(3.5) * (T(1) - t * t) * y.gradient[i];
+        }
+    });
+    return y;
+}
+
+template <class T>
+Tensor<T> tanh_of(Tape<T>& tape, Tensor<T> x) {
+    const Tensor<T> y = tape.make(x.rows, x.columns);
+    for (size_t i = 0; i < x.size(); ++i) y.value[i] = std::tanh(x.value[i]);
+    tape.on_backward([=] {
+        for (size_t i = 0; i < x.size(); ++i) x.gradient[i] += (T(1) - y.value[i] * y.value[i]) * y.gradient[i];
+    });
+    return y;
+}
+
+// log of the softmax of each row of the logits, [n, moves].
+template <class T>
+Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
+    const Tensor<T> y = tape.make(logits.rows, logits.columns);
+    const ptrdiff_t moves = logits.columns;
+    for (ptrdiff_t row = 0; row < logits.rows; ++row) {
+        const T* x = logits.value + row * moves;
+        const T largest = *std::max_element(x, x + moves);
+        T total = 0;
+        for (ptrdiff_t j = 0; j < moves; ++j) total += std::exp(x[j] - largest);
+        for (ptrdiff_t j = 0; j < moves; ++j) y.value[row * moves + j] = x[j] - largest - std::log(total);
+    }
+    tape.on_backward([=] {
+        for (ptrdiff_t row = 0; row < logits.rows; ++row) {
+            const T *dy = y.gradient + row * moves, *log_p = y.value + row * moves;
+            T total = 0;
+            for (ptrdiff_t j = 0; j < moves; ++j) total += dy[j];
+            for (ptrdiff_t j = 0; j < moves; ++j)
+                logits.gradient[row * moves + j] += dy[j] - std::exp(log_p[j]) * total;
+        }
+    });
+    return y;
+}
+
+// pi_theta(. | s_{-C,t}, g_{-C,t}) for every asking state token of the batch, in order of windows and steps.
+template <class T>
+Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Ask ask) {
+    const TokenLayout layout = token_layout(batch, ask);
+    Tensor<T> x = layer_norm(tape, embed_tokens(tape, model, batch, layout), model.embed_ln);
+    x = add_dropout(tape, {}, x, dropout_at(tape, 0, model.config.dropout));
+    for (int layer = 0; layer < model.config.layers; ++layer) {
+        const bool last = layer + 1 == model.config.layers;
+        x = transformer_block(tape, model, layer, x, last ? layout.asked : layout.all,
+                              last ? layout.asking : layout.every_token);
+    }
+    x = layer_norm(tape, x, model.ln_f);
+    const Tensor<T> mean = linear(tape, x, model.predict_mean);
+    if (model.config.head == Head::categorical) return {log_softmax(tape, mean), {}};
+    if (model.config.head == Head::deterministic) return {tanh_of(tape, mean), {}};
+    return {mean, squash_log_std(tape, linear(tape, x, model.predict_log_std))};
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Policy heads: log-likelihood and entropy of each row, [n, 1].
+
+// log(1 + exp(x)) without overflow.
+template <class T>
+T softplus(T x) {
+    return std::max(x, T(0)) + std::log1p(std::exp(-std::abs(x)));
+}
+
+// log |d tanh(u) / du| = log(1 - tanh(u)^2), exact also where tanh rounds to 1.
+template <class T>
+T log_tanh_slope(T u) {
+    return T(2) * (T(0.69314718055994531) - u - softplus(T(-2) * u));
+}
+
+constexpr double half_log_2_pi = 0.91893853320467274;
+
+// log pi(a) of a = tanh(u), u ~ N(mean, exp(log_std)^2), summed over the action's dimensions: with u = atanh(a),
+// sum of -((u - mean) / std)^2 / 2 - log_std - log(2 pi) / 2 - log(1 - a^2). actions [n, A], strictly inside (-1, 1).
+template <class T>
+Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* actions) {
+    const Tensor<T> mean = policy.mean, log_std = policy.log_std, y = tape.make(mean.rows, 1);
+    const Tensor<T> a = tape.constant(actions, mean.rows, mean.columns);
+    const size_t columns = static_cast<size_t>(mean.columns);
+    const auto standardised = [=](size_t i) {
+        return (std::atanh(a.value[i]) - mean.value[i]) / std::exp(log_std.value[i]);
+    };
+    for (size_t i = 0; i < a.size(); ++i) {
+        if (i % columns == 0) y.value[i / columns] = 0;
+        const T z = standardised(i);
+        y.value[i / columns] +=
+            T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(std::atanh(a.value[i]));
+    }
+    tape.on_backward([=] {
+        for (size_t i = 0; i < a.size(); ++i) {
+            const T z = standardised(i), dy = y.gradient[i / columns];
+            mean.gradient[i] += dy * z / std::exp(log_std.value[i]);
+            log_std.gradient[i] += dy * (z * z - T(1));
+        }
+    });
+    return y;
+}
+
+// One-sample estimate of the entropy, -log pi(tanh(u)) with u = mean + exp(log_std) noise; noise [n, A] standard
+// normal. The gradient flows through the sample, as ODT's does: the Gaussian term is then noise^2 / 2, a constant.
+template <class T>
+Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) {
+    const Tensor<T> mean = policy.mean, log_std = policy.log_std, y = tape.make(mean.rows, 1);
+    const Tensor<T> n = tape.constant(noise, mean.rows, mean.columns);
+    const size_t columns = static_cast<size_t>(mean.columns);
+    const auto sample = [=](size_t i) { return mean.value[i] + std::exp(log_std.value[i]) * n.value[i]; };
+    for (size_t i = 0; i < n.size(); ++i) {
+        if (i % columns == 0) y.value[i / columns] = 0;
+        y.value[i / columns] +=
+            T(0.5) * n.value[i] * n.value[i] + log_std.value[i] + T(half_log_2_pi) + log_tanh_slope(sample(i));
+    }
+    tape.on_backward([=] {
+        for (size_t i = 0; i < n.size(); ++i) {  // d log_tanh_slope(u) / du = -2 tanh(u)
+            const T slope = T(-2) * std::tanh(sample(i)), dy = y.gradient[i / columns];
+            mean.gradient[i] += dy * slope;
+            log_std.gradient[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
+        }
+    });
+    return y;
+}
+
+// log pi(a): the entry of each row that the action names. actions [n, 1], whole numbers.
+template <class T>
+Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* actions) {
+    const Tensor<T> y = tape.make(log_p.rows, 1), a = tape.constant(actions, log_p.rows, 1);
+    const auto named = [=](ptrdiff_t row) { return row * log_p.columns + static_cast<ptrdiff_t>(a.value[row]); };
+    for (ptrdiff_t row = 0; row < y.rows; ++row) y.value[row] = log_p.value[named(row)];
+    tape.on_backward([=] {
+        for (ptrdiff_t row = 0; row < y.rows; ++row) log_p.gradient[named(row)] += y.gradient[row];
+    });
+    return y;
+}
+
+// H = -sum p log p, exact.
+template <class T>
+Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
+    const Tensor<T> y = tape.make(log_p.rows, 1);
+    const ptrdiff_t moves = log_p.columns;
+    for (ptrdiff_t row = 0; row < y.rows; ++row) {
+        y.value[row] = 0;
+        for (ptrdiff_t j = row * moves; j < (row + 1) * moves; ++j)
+            y.value[row] -= std::exp(log_p.value[j]) * log_p.value[j];
+    }
+    tape.on_backward([=] {
+        for (ptrdiff_t j = 0; j < y.rows * moves; ++j)
+            log_p.gradient[j] -= y.gradient[j / moves] * std::exp(log_p.value[j]) * (log_p.value[j] + T(1));
+    });
+    return y;
+}
+
+// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions.
+template <class T>
+Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* actions) {
+    const Tensor<T> y = tape.make(prediction.rows, 1), a = tape.constant(actions, prediction.rows, prediction.columns);
+    const ptrdiff_t columns = prediction.columns;
+    for (ptrdiff_t row = 0; row < y.rows; ++row) {
+        y.value[row] = 0;
+        for (ptrdiff_t j = row * columns; j < (row + 1) * columns; ++j) {
+            const T error = prediction.value[j] - a.value[j];
+            y.value[row] += error * error / T(columns);
+        }
+    }
+    tape.on_backward([=] {
+        for (ptrdiff_t j = 0; j < y.rows * columns; ++j)
+            prediction.gradient[j] += y.gradient[j / columns] * T(2) * (prediction.value[j] - a.value[j]) / T(columns);
+    });
+    return y;
+}
+
+// sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
+template <class T>
+Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const float* coefficients) {
+    const Tensor<T> y = tape.make(1, 1), c = tape.constant(coefficients, x.rows, 1);
+    y.value[0] = 0;
+    for (int i = 0; i < x.rows; ++i) y.value[0] += c.value[i] * x.value[i];
+    tape.on_backward([=] {
+        for (int i = 0; i < x.rows; ++i) x.gradient[i] += c.value[i] * y.gradient[0];
+    });
+    return y;
+}
+
+// a x + b y, [1, 1].
+template <class T>
+Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
+    const Tensor<T> z = tape.make(1, 1);
+    z.value[0] = a * x.value[0] + b * y.value[0];
+    tape.on_backward([=] {
+        x.gradient[0] += a * z.gradient[0];
+        y.gradient[0] += b * z.gradient[0];
+    });
+    return z;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Optimisers. One struct: LAMB and AdamW differ in where the weight decay goes and in the trust ratio; Adam is AdamW
+// without decay.
+
+struct OptimizerConfig {
+    enum class Rule { lamb, adamw } rule = Rule::lamb;
+    double learning_rate = 1e-3, beta1 = 0.9, beta2 = 0.999, epsilon = 1e-8, weight_decay = 0;
+    bool always_adapt = false;  // LAMB's trust ratio also without weight decay
+    double clip_norm = 0.25;    // of the gradient over all tensors; 0: no clipping
+    uint64_t warmup_updates = 10000;
+};
+
+struct Optimizer {
+    uint64_t updates = 0;
+    std::vector<std::vector<float>> first_moment, second_moment;  // one of each per parameter tensor
+};
+
+// Linear warm-up: the factor of update n = 0, 1, ... is min((n + 1) / warmup, 1). ODT's code.
+inline double warmup_factor(uint64_t update, uint64_t warmup_updates) {
+    return update + 1 >= warmup_updates ? 1.0 : static_cast<double>(update + 1) / static_cast<double>(warmup_updates);
+}
+
+// Sum of squares in double, in blocks of 4096 added in order, the blocks on all threads.
+template <class T>
+double sum_of_squares(Compute& compute, const std::vector<T>& x) {
+    constexpr size_t block = 4096;
+    std::vector<double> sums((x.size() + block - 1) / block);
+    for_rows(compute, static_cast<int>(sums.size()), block, [&](int begin, int end) {
+        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
+            for (size_t i = b * block; i < std::min(x.size(), (b + 1) * block); ++i)
+                sums[b] += static_cast<double>(x[i]) * x[i];
+    });
+    double total = 0;
+    for (const double sum : sums) total += sum;
+    return total;
+}
+
+// x^n by squaring: libm's pow in double differs between processors.
+inline double power(double x, uint64_t n) {
+    double result = 1;
+    for (; n > 0; n /= 2, x *= x)
+        if (n % 2 == 1) result *= x;
+    return result;
+}
+
+// A tensor's share of the update, plain: m, v and the step u (before the learning rate), from the clipped gradient.
+//   m = beta1 m + (1 - beta1) g;  v = beta2 v + (1 - beta2) g^2
+//   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon)
+// Written over the gradient, which is not needed any more.
+inline void adam_step(float* gradient, float* m, float* v, const float* value, size_t n, const OptimizerConfig& config,
+                      double scale, double bias1, double bias2) {
+    const float beta1 = static_cast<float>(config.beta1), beta2 = static_cast<float>(config.beta2);
+    const float one_minus_1 = static_cast<float>(1 - config.beta1), one_minus_2 = static_cast<float>(1 - config.beta2);
+    const float clip = static_cast<float>(scale), root_bias2 = static_cast<float>(std::sqrt(bias2));
+    const float inverse_bias1 = static_cast<float>(1 / bias1), epsilon = static_cast<float>(config.epsilon);
+    const float decay = config.rule == OptimizerConfig::Rule::lamb ? static_cast<float>(config.weight_decay) : 0.0f;
+    for (size_t i = 0; i < n; ++i) {
+        const float g = gradient[i] * clip;
+        m[i] = beta1 * m[i] + one_minus_1 * g;
+        v[i] = beta2 * v[i] + one_minus_2 * g * g;
+        gradient[i] = m[i] * inverse_bias1 / (std::sqrt(v[i]) / root_bias2 + epsilon) + decay * value[i];
+    }
+}
+
+// Norm of all gradients. Errors: nn.not_finite names the tensor.
+template <class T>
+double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
+    double total = 0;
+    for (const Parameter<T>& parameter : parameters) {
+        const double squares = sum_of_squares(compute, parameter.gradient);
+        if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
+        total += squares;
+    }
+    return std::sqrt(total);
+}
+
+// One update of all parameters from their gradients; returns the gradient's norm before clipping.
+// LAMB as ODT has it: per tensor (Q, K, V are one), step times ||value|| / ||u||, and 1 where either norm is 0; skipped
+// altogether at weight decay 0 unless always_adapt. Errors: nn.not_finite names the tensor, before anything is changed
+// (gradient), or after (value).
+inline double update_parameters(Compute& compute, std::vector<Parameter<float>>& parameters, Optimizer& optimizer,
+                                const OptimizerConfig& config) {
+    const double norm = gradient_norm(compute, parameters);
+    // PyTorch's clip_grad_norm_: scale by limit / (norm + 1e-6) where that is below 1.
+    const double scale = config.clip_norm > 0 ? std::min(1.0, config.clip_norm / (norm + 1e-6)) : 1.0;
+    const double learning_rate = config.learning_rate * warmup_factor(optimizer.updates, config.warmup_updates);
+    const uint64_t t = ++optimizer.updates;
+    const double bias1 = 1 - power(config.beta1, t), bias2 = 1 - power(config.beta2, t);
+    const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
+    optimizer.first_moment.resize(parameters.size());
+    optimizer.second_moment.resize(parameters.size());
+    for (size_t p = 0; p < parameters.size(); ++p) {
+        Parameter<float>& parameter = parameters[p];
+        std::vector<float>&m = optimizer.first_moment[p], &v = optimizer.second_moment[p];
+        const size_t n = parameter.value.size();
+        constexpr size_t block = 4096;
+        const int blocks = static_cast<int>((n + block - 1) / block);
+        m.resize(n);
+        v.resize(n);
+        for_rows(compute, blocks, 16 * block, [&](int begin, int end) {
+            const size_t first = static_cast<size_t>(begin) * block,
+                         count = std::min(n, static_cast<size_t>(end) * block) - first;
+            adam_step(parameter.gradient.data() + first, m.data() + first, v.data() + first,
+                      parameter.value.data() + first, count, config, scale, bias1, bias2);
+        });
+        double trust = 1;
+        if (lamb && (config.weight_decay != 0 || config.always_adapt)) {
+            const double value_norm = std::sqrt(sum_of_squares(compute, parameter.value));
+            const double step_norm = std::sqrt(sum_of_squares(compute, parameter.gradient));
+            if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
+        }
+        const float rate = static_cast<float>(learning_rate * trust);
+        const float shrink =
+            lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
+        std::vector<unsigned char> bad(static_cast<size_t>(blocks));
+        for_rows(compute, blocks, 4 * block, [&](int begin, int end) {
+            for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b) {
+                float zero = 0;  // 0 * x is 0 unless x is infinite or NaN
+                for (size_t i = b * block; i < std::min(n, (b + 1) * block); ++i) {
+                    parameter.value[i] = shrink * parameter.value[i] - rate * parameter.gradient[i];
+                    zero += 0 * parameter.value[i];
+                    parameter.gradient[i] = 0;
+                }
+                bad[b] = !(zero == 0);
+            }
+        });
+        for (const unsigned char block_bad : bad)
+            if (block_bad) fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
+    }
+    return norm;
+}

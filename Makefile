@@ -1,0 +1,75 @@
+# WODTEM: a reference implementation in one binary. Needs g++ (12 or newer) and make; `make run` and `make test` install
+# g++ with apt where it is missing.
+#
+#   make run              build, run DT, ODT and WODTEM on the grid world (preset small, about a minute), show the report
+#   make test             build and run every test; the last line is "N passed, N failed"
+#   make                  build ./wodtem alone
+#   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable
+#   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
+#   make bench            the machine's peak, each kernel's share of it, update and look-up times
+#   make format           lay out the sources with clang-format
+#   make clean            remove what was built (runs/ stays)
+
+CXX = g++
+# -O3: loops in vectors. -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
+# -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
+CXXFLAGS = -std=c++20 -O3 -g -pthread -ffp-contract=off \
+           -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
+HEADERS = $(wildcard *.hpp data/*.hpp tests/*.hpp)
+TESTS = $(patsubst tests/%.cpp,%,$(wildcard tests/*.cpp))
+SOURCES = $(wildcard *.hpp *.cpp data/*.hpp tests/*.hpp tests/*.cpp)
+
+wodtem: wodtem.cpp $(HEADERS) | compiler
+	$(CXX) $(CXXFLAGS) $< -o $@
+
+# A fresh Debian has apt and make at most.
+compiler:
+	@command -v $(CXX) >/dev/null || { echo "installing g++"; \
+	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq g++; \
+	  else sudo apt-get update -qq && sudo apt-get install -y -qq g++; fi; }
+
+run: wodtem
+	@for method in dt odt wodtem; do ./wodtem train gridworld --method $$method --seed 0 --preset small || exit 1; done
+	@./wodtem report runs/gridworld-small-dt-0 runs/gridworld-small-odt-0 runs/gridworld-small-wodtem-0
+
+paper-gridworld: wodtem
+	./wodtem sweep gridworld --preset paper --seeds 0-4 --estimate
+	./wodtem sweep gridworld --preset paper --seeds 0-4 | sh
+	./wodtem report runs/gridworld-paper-*
+
+# One object per test file, so that make -j helps; test_wodtem.cpp includes wodtem.cpp.
+build/%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
+	@mkdir -p build
+	$(CXX) $(CXXFLAGS) -O2 -c $< -o $@
+
+build/tests: $(TESTS:%=build/%.o)
+	$(CXX) $(CXXFLAGS) $^ -o $@
+
+test: wodtem build/tests
+	build/tests
+
+build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
+	@mkdir -p build
+	$(CXX) $(CXXFLAGS) -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -c $< -o $@
+
+build/tests-sanitized: $(TESTS:%=build/san-%.o)
+	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@
+
+build/tests-threads: tests/main.cpp tests/test_nn.cpp $(HEADERS)
+	@mkdir -p build
+	$(CXX) $(CXXFLAGS) -O1 -fsanitize=thread tests/main.cpp tests/test_nn.cpp -o $@
+
+sanitize: wodtem build/tests-sanitized build/tests-threads
+	build/tests-threads thread
+	build/tests-sanitized
+
+bench: wodtem
+	./wodtem bench
+
+format:
+	clang-format -i $(SOURCES)
+
+clean:
+	rm -rf build wodtem
+
+.PHONY: compiler run paper-gridworld test sanitize bench format clean

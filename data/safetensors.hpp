@@ -1,0 +1,603 @@
+// safetensors.hpp: bytes to and from disk. Whole files, logs that only grow, and safetensors, which is how models,
+// checkpoints and golden vectors are kept (any version of the `safetensors` Python package opens them).
+//
+//   offset  0                8                                  8 + N                            end of file
+//           +----------------+----------------------------------+--------------------------------+
+//           | N, u64 little- | JSON, then spaces up to a        | data: little-endian, row-major |
+//           | endian, <= 1e8 | multiple of 8 bytes              | every byte belongs to 1 tensor |
+//           +----------------+----------------------------------+--------------------------------+
+//   JSON:   {"__metadata__":{"crc32.header":"89abcdef","crc32.tensors":"0123456789abcdef...","KEY":"TEXT",...},
+//            "NAME":{"dtype":"F32","shape":[2,3],"data_offsets":[BEGIN,END]},...}        offsets count from 8 + N
+//
+// Two metadata entries are ours. crc32.tensors: 8 hex digits for each tensor, in the order of the data. crc32.header:
+// the CRC-32 of bytes 0 to 8 + N, its own eight digits (bytes 41 to 48) taken as 00000000. A file with neither was made
+// elsewhere and is read unchecked; otherwise both must hold, so no single changed bit goes unnoticed.
+// Promises: equal contents give equal bytes; no input crashes the reader or makes it allocate out of proportion; a
+// write that fails leaves the old file as it was; every error names the file and the tensor or offset. Leaves out:
+// dtypes that nobody here needs, memory mapping, big-endian machines, two processes writing one path.
+#pragma once
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cerrno>
+#include <charconv>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <map>
+#include <optional>
+#include <ranges>
+#include <span>
+#include <string>
+#include <string_view>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "../nn.hpp"
+
+static_assert(std::endian::native == std::endian::little, "tensors are copied as they lie in memory");
+static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Files
+
+struct FileDescriptor {
+    int fd;
+    explicit FileDescriptor(int opened) : fd(opened) {}
+    FileDescriptor(const FileDescriptor&) = delete;
+    FileDescriptor& operator=(const FileDescriptor&) = delete;
+    ~FileDescriptor() {
+        if (fd >= 0) ::close(fd);
+    }
+};
+
+// Call at once after the failure: it reads errno.
+[[noreturn]] inline void fail_file(const char* id, const char* action, const std::string& path) {
+    fail(id, "%s: cannot %s: %s", path.c_str(), action, std::strerror(errno));
+}
+
+// The size in bytes of an open regular file; a folder, pipe or device is refused.
+inline size_t regular_file_size(const FileDescriptor& file, const std::string& path) {
+    struct stat status {};
+    if (::fstat(file.fd, &status) != 0) fail_file("file.read", "ask for its size", path);
+    if (!S_ISREG(status.st_mode))
+        fail("file.not_regular", "%s: is not a regular file; give a file's path", path.c_str());
+    return static_cast<size_t>(status.st_size);
+}
+
+// The whole file. `limit` (bytes) is checked before anything is allocated.
+inline std::string read_file(const std::string& path, size_t limit = size_t{1} << 36) {
+    const FileDescriptor file(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));  // a pipe must not block us
+    if (file.fd < 0) fail_file("file.open", "open it", path);
+    const size_t size = regular_file_size(file, path);
+    if (size > limit) fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), size, limit);
+    std::string bytes(size, '\0');
+    for (size_t done = 0; done < size;) {
+        const ssize_t count = ::read(file.fd, bytes.data() + done, size - done);
+        if (count < 0 && errno == EINTR) continue;
+        if (count < 0) fail_file("file.read", "read it", path);
+        if (count == 0) fail("file.read", "%s: shrank while it was read (%zu bytes); try again", path.c_str(), size);
+        done += static_cast<size_t>(count);
+    }
+    return bytes;
+}
+
+// The only place that writes to a disk: POSIX write() may be interrupted and may take less than it was given.
+inline void write_all(const FileDescriptor& file, std::string_view bytes, const std::string& path) {
+    while (!bytes.empty()) {
+        const ssize_t count = ::write(file.fd, bytes.data(), bytes.size());
+        if (count < 0 && errno == EINTR) continue;
+        if (count < 0) fail_file("file.write", "write it", path);
+        bytes.remove_prefix(static_cast<size_t>(count));
+    }
+}
+
+inline void sync_to_disk(const FileDescriptor& file, const std::string& path) {
+    if (::fsync(file.fd) != 0) fail_file("file.write", "flush it to the disk", path);
+}
+
+// After a rename: without this a power cut may bring the old name back.
+inline void sync_folder_of(const std::string& path) {
+    const size_t slash = path.find_last_of('/');
+    const std::string folder = slash == std::string::npos ? "." : path.substr(0, slash + 1);
+    const FileDescriptor file(::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC));
+    if (file.fd < 0) fail_file("file.write", "open the folder to flush it", folder);
+    // EINVAL: this file system has no such operation.
+    if (::fsync(file.fd) != 0 && errno != EINVAL) fail_file("file.write", "flush the folder to the disk", folder);
+}
+
+// The pieces, one after the other, become the file `path`: whoever looks finds the old file or the whole new one.
+// The temporary is PATH.tmp; one left by a killed process is overwritten by the next write.
+inline void write_file_atomic(const std::string& path, std::span<const std::string_view> pieces) {
+    const std::string temporary = path + ".tmp";
+    const FileDescriptor file(::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666));
+    if (file.fd < 0) fail_file("file.write", "create it", temporary);
+    try {
+        for (const std::string_view piece : pieces) write_all(file, piece, temporary);
+        sync_to_disk(file, temporary);
+        if (::rename(temporary.c_str(), path.c_str()) != 0) fail_file("file.write", "rename PATH.tmp to it", path);
+    } catch (const Error&) {
+        ::unlink(temporary.c_str());
+        throw;
+    }
+    sync_folder_of(path);  // if only this fails, the new file is already in place
+}
+
+inline void write_file_atomic(const std::string& path, std::string_view bytes) {
+    write_file_atomic(path, std::span<const std::string_view>(&bytes, 1));
+}
+
+// A log that grows. Text reaches the system with each append (no buffer of our own), the disk with sync(): note size()
+// in a checkpoint after sync(), and give it to truncate_file before continuing from that checkpoint.
+struct AppendFile {
+    std::string path;
+    FileDescriptor file;
+
+    explicit AppendFile(const std::string& path_)
+        : path(path_),
+          file(::open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0666)) {
+        if (file.fd < 0) fail_file("file.open", "open it for writing", path);
+        regular_file_size(file, path);
+    }
+    void append(std::string_view text) const { write_all(file, text, path); }
+    void sync() const { sync_to_disk(file, path); }
+    size_t size() const { return regular_file_size(file, path); }
+};
+
+// Drops what a log gained after the checkpoint that noted `size` bytes.
+inline void truncate_file(const std::string& path, size_t size) {
+    const FileDescriptor file(::open(path.c_str(), O_WRONLY | O_CLOEXEC | O_NONBLOCK));
+    if (file.fd < 0) fail_file("file.open", "open it for writing", path);
+    const size_t found = regular_file_size(file, path);
+    if (found < size)
+        fail("file.shorter", "%s: has %zu bytes, the checkpoint was saved when it had %zu; restore it or start anew",
+             path.c_str(), found, size);
+    if (::ftruncate(file.fd, static_cast<off_t>(size)) != 0) fail_file("file.write", "shorten it", path);
+    sync_to_disk(file, path);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// CRC-32 as in zlib and PNG: polynomial 0x04C11DB7, bits reversed, inverted before and after. Finds every single
+// changed bit and every burst of up to 32 bits.
+
+// crc_tables[k][b]: the effect of byte b followed by k zero bytes, so that eight bytes take eight independent look-ups.
+inline constexpr auto crc_tables = [] {
+    std::array<std::array<uint32_t, 256>, 8> tables{};
+    for (uint32_t byte = 0; byte < 256; ++byte) {
+        uint32_t crc = byte;
+        for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1) ^ ((crc & 1) != 0 ? 0xEDB88320u : 0u);
+        tables[0][byte] = crc;
+    }
+    for (size_t k = 1; k < 8; ++k)
+        for (size_t byte = 0; byte < 256; ++byte)
+            tables[k][byte] = (tables[k - 1][byte] >> 8) ^ tables[0][tables[k - 1][byte] & 255];
+    return tables;
+}();
+
+// crc32(b, crc32(a)) is the checksum of a followed by b.
+inline uint32_t crc32(std::string_view bytes, uint32_t before = 0) {
+    uint32_t crc = ~before;
+    while (bytes.size() >= 8) {
+        uint64_t w;
+        std::memcpy(&w, bytes.data(), 8);
+        w ^= crc;
+        crc = crc_tables[7][w & 255] ^ crc_tables[6][w >> 8 & 255] ^ crc_tables[5][w >> 16 & 255] ^
+              crc_tables[4][w >> 24 & 255] ^ crc_tables[3][w >> 32 & 255] ^ crc_tables[2][w >> 40 & 255] ^
+              crc_tables[1][w >> 48 & 255] ^ crc_tables[0][w >> 56];
+        bytes.remove_prefix(8);
+    }
+    for (const char byte : bytes) crc = (crc >> 8) ^ crc_tables[0][(crc ^ static_cast<uint8_t>(byte)) & 255];
+    return ~crc;
+}
+
+inline std::string hex8(uint32_t value) {
+    char digits[9];
+    std::snprintf(digits, sizeof digits, "%08x", value);
+    return digits;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Tensors
+
+enum class DType : uint8_t { F32, F64, U8, U32, U64, I64 };
+struct DTypeInfo {
+    const char* name;
+    size_t size;  // bytes of one element
+};
+inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"U8", 1}, {"U32", 4}, {"U64", 8}, {"I64", 8}};
+inline const DTypeInfo& about(DType dtype) { return dtypes[static_cast<size_t>(dtype)]; }
+
+template <class T>
+consteval DType dtype_of() {
+    if constexpr (std::is_same_v<T, float>) return DType::F32;
+    if constexpr (std::is_same_v<T, double>) return DType::F64;
+    if constexpr (std::is_same_v<T, uint8_t>) return DType::U8;
+    if constexpr (std::is_same_v<T, uint32_t>) return DType::U32;
+    if constexpr (std::is_same_v<T, uint64_t>) return DType::U64;
+    if constexpr (std::is_same_v<T, int64_t>) return DType::I64;
+}  // any other type does not compile: no return
+
+using Shape = std::vector<uint64_t>;  // {} is a scalar: one element
+
+inline std::string shape_text(const Shape& shape) {
+    std::string text = "[";
+    for (const uint64_t extent : shape) text += (text.size() > 1 ? ", " : "") + std::to_string(extent);
+    return text + "]";
+}
+
+// False if the size in bytes does not fit 64 bits.
+inline bool byte_size(size_t& size, const Shape& shape, DType dtype) {
+    size = about(dtype).size;
+    for (const uint64_t extent : shape)
+        if (__builtin_mul_overflow(size, extent, &size)) return false;
+    return true;
+}
+
+// A JSON string with its quotes.
+inline std::string json_string(std::string_view text) {
+    std::string out = "\"";
+    for (const char c : text) {
+        if (c == '"' || c == '\\') out += '\\';
+        const bool control = (c >= 0 && c < 0x20) || c == 0x7F;
+        out += control ? "\\u" + hex8(static_cast<uint32_t>(c)).substr(4) : std::string(1, c);
+    }
+    return out + "\"";
+}
+
+// UTF-8 as RFC 3629 has it: no overlong forms, no surrogates, nothing above U+10FFFF.
+inline bool is_utf8(std::string_view text) {
+    constexpr uint32_t least[] = {0, 0x80, 0x800, 0x10000};  // by number of bytes that follow the first
+    for (size_t i = 0; i < text.size();) {
+        const auto first = static_cast<uint8_t>(text[i++]);
+        if (first < 0x80) continue;
+        const int more = first >= 0xF0 ? 3 : first >= 0xE0 ? 2 : 1;
+        uint32_t code = first & (0x3Fu >> more);
+        for (int k = 0; k < more; ++k, ++i) {
+            if (i >= text.size() || (text[i] & 0xC0) != 0x80) return false;
+            code = code << 6 | (text[i] & 0x3F);
+        }
+        const bool surrogate = code >> 11 == 0xD800 >> 11;
+        if (first < 0xC0 || first >= 0xF8 || code < least[more] || code > 0x10FFFF || surrogate) return false;
+    }
+    return true;
+}
+
+// A name can be printed on a terminal as it is.
+inline void check_name(const std::string& name, const std::string& path) {
+    const auto control = [](char c) { return (c >= 0 && c < 0x20) || c == 0x7F; };
+    if (name == "__metadata__" || std::any_of(name.begin(), name.end(), control))
+        fail("safetensors.name", "%s: %s cannot name a tensor: no control characters, not __metadata__", path.c_str(),
+             json_string(name.substr(0, 80)).c_str());
+}
+
+struct StoredTensor {
+    std::string name;
+    DType dtype;
+    Shape shape;
+    size_t begin, size;  // bytes; `begin` counts from TensorFile::data_start
+};
+
+// Contents of one file, read or to be written. The tensors cover `buffer` from data_start to its end, in order, without
+// a gap: a file that was read is kept as it came (data_start = 8 + N), a new one has its data alone.
+struct TensorFile {
+    std::string path = "(not yet saved)";         // for messages
+    std::map<std::string, std::string> metadata;  // sorted, without the two checksum entries
+    std::vector<StoredTensor> tensors;
+    std::map<std::string, size_t> index;  // name -> place in `tensors`
+    std::string buffer;
+    size_t data_start = 0;
+
+    std::string_view bytes(const StoredTensor& tensor) const {
+        return std::string_view(buffer).substr(data_start + tensor.begin, tensor.size);
+    }
+    bool has(const std::string& name) const { return index.contains(name); }
+
+    const StoredTensor& find(const std::string& name) const {
+        const auto found = index.find(name);
+        if (found == index.end())
+            fail("safetensors.missing", "%s: has no tensor %s among its %zu; is it a file of this kind?", path.c_str(),
+                 json_string(name).c_str(), tensors.size());
+        return tensors[found->second];
+    }
+
+    const std::string& text(const std::string& key) const {
+        const auto found = metadata.find(key);
+        if (found == metadata.end())
+            fail("safetensors.missing", "%s: has no metadata entry %s; is it a file of this kind?", path.c_str(),
+                 json_string(key).c_str());
+        return found->second;
+    }
+
+    // Copies `values` (vector, span or array; row-major) to the end. A scalar: add("step", {}, std::array{n}).
+    template <std::ranges::contiguous_range Values>
+    void add(const std::string& name, const Shape& shape, const Values& values) {
+        const std::span data(std::ranges::data(values), std::ranges::size(values));
+        constexpr DType dtype = dtype_of<std::ranges::range_value_t<Values>>();
+        check_name(name, path);
+        size_t size = 0;
+        if (!byte_size(size, shape, dtype) || size != data.size_bytes())
+            fail("safetensors.shape", "%s: tensor %s of shape %s was given %zu elements", path.c_str(),
+                 json_string(name).c_str(), shape_text(shape).c_str(), data.size());
+        if (!index.emplace(name, tensors.size()).second)
+            fail("safetensors.duplicate_name", "%s: tensor %s was added twice", path.c_str(),
+                 json_string(name).c_str());
+        tensors.push_back({name, dtype, shape, buffer.size() - data_start, size});
+        if (size > 0) buffer.append(reinterpret_cast<const char*>(data.data()), size);
+    }
+
+    // Copies tensor `name` to `out`, which must have the stored type, shape and number of elements.
+    template <class T>
+    void read_into(std::span<T> out, const std::string& name, const Shape& shape) const {
+        const StoredTensor& tensor = find(name);
+        if (tensor.dtype != dtype_of<T>())
+            fail("safetensors.dtype", "%s: tensor %s has dtype %s, expected %s", path.c_str(),
+                 json_string(name).c_str(), about(tensor.dtype).name, about(dtype_of<T>()).name);
+        if (tensor.shape != shape || tensor.size != out.size_bytes())
+            fail("safetensors.shape",
+                 "%s: tensor %s has shape %s, expected %s (%zu elements); made with other settings?", path.c_str(),
+                 json_string(name).c_str(), shape_text(tensor.shape).c_str(), shape_text(shape).c_str(), out.size());
+        if (!out.empty()) std::memcpy(out.data(), bytes(tensor).data(), tensor.size);  // the file need not be aligned
+    }
+
+    template <class T>
+    std::vector<T> get(const std::string& name, const Shape& shape) const {
+        std::vector<T> out(find(name).size / sizeof(T));
+        read_into(std::span(out), name, shape);
+        return out;
+    }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Writing
+
+inline constexpr size_t header_limit = 100'000'000;  // bytes; the same as in the original implementation
+inline constexpr std::string_view header_start = "{\"__metadata__\":{\"crc32.header\":\"";
+inline constexpr size_t crc_at = 8 + header_start.size();  // 41
+
+// CRC-32 of bytes 0 to 8 + N with its own digits taken as zeros.
+inline std::string header_checksum(std::string_view start) {
+    const uint32_t before = crc32("00000000", crc32(start.substr(0, crc_at)));
+    return hex8(crc32(start.substr(crc_at + 8), before));
+}
+
+// Bytes 0 to 8 + N of the file.
+inline std::string file_start(const TensorFile& file) {
+    std::string out = std::string(8, '\0') + std::string(header_start) + "00000000\",\"crc32.tensors\":\"";
+    for (const StoredTensor& tensor : file.tensors) out += hex8(crc32(file.bytes(tensor)));
+    out += "\"";
+    for (const auto& [key, text] : file.metadata) out += "," + json_string(key) + ":" + json_string(text);
+    out += "}";
+    for (const StoredTensor& tensor : file.tensors) {
+        out += "," + json_string(tensor.name) + ":{\"dtype\":\"" + about(tensor.dtype).name + "\",\"shape\":[";
+        for (size_t i = 0; i < tensor.shape.size(); ++i) out += (i > 0 ? "," : "") + std::to_string(tensor.shape[i]);
+        out += "],\"data_offsets\":[" + std::to_string(tensor.begin) + "," +
+               std::to_string(tensor.begin + tensor.size) + "]}";
+    }
+    out += "}";
+    out.resize((out.size() + 7) / 8 * 8, ' ');
+    const size_t length = out.size() - 8;
+    const bool reserved = file.metadata.contains("crc32.header") || file.metadata.contains("crc32.tensors");
+    if (length > header_limit || reserved || !is_utf8(std::string_view(out).substr(8)))
+        fail("safetensors.metadata", "%s: names and metadata (%zu bytes) must be UTF-8, below 100 MB, without crc32.*",
+             file.path.c_str(), length);
+    std::memcpy(out.data(), &length, 8);
+    out.replace(crc_at, 8, header_checksum(out));
+    return out;
+}
+
+inline std::string serialise_safetensors(const TensorFile& file) {
+    return file_start(file) + file.buffer.substr(file.data_start);
+}
+
+// As above, straight to the disk: several hundred megabytes are not copied once more.
+inline void write_safetensors(const std::string& path, const TensorFile& file) {
+    const std::string start = file_start(file);
+    write_file_atomic(path, std::array{std::string_view(start), std::string_view(file.buffer).substr(file.data_start)});
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Reading. Nothing here recurses: a header is objects two deep, written out as such, and anything else is refused.
+
+struct HeaderReader {
+    std::string_view file;  // bytes 0 to 8 + N
+    const std::string& path;
+    size_t at = 8;  // next byte; messages give it as the offset in the file
+
+    [[noreturn]] void expected(const char* what) const {
+        fail("safetensors.json", "%s: offset %zu: expected %s; the file is damaged or is not safetensors", path.c_str(),
+             at, what);
+    }
+    void skip_space() {
+        while (at < file.size() && std::string_view(" \t\r\n").find(file[at]) != std::string_view::npos) ++at;
+    }
+    bool take(char c) {
+        skip_space();
+        const bool found = at < file.size() && file[at] == c;
+        at += found ? 1 : 0;
+        return found;
+    }
+    void need(char c) {
+        if (!take(c)) expected(std::string(1, c).c_str());
+    }
+
+    // \uXXXX as UTF-8. Surrogate pairs are refused: whoever writes characters above U+FFFF writes them as UTF-8.
+    std::string unicode_escape() {
+        uint32_t code = 0;
+        const std::string_view digits = file.substr(at, 4);
+        const char* end = digits.data() + digits.size();
+        if (std::from_chars(digits.data(), end, code, 16).ptr != end || digits.size() < 4) expected("4 hex digits");
+        if (code >> 11 == 0xD800 >> 11) expected("no surrogate");
+        at += 4;
+        const char last = static_cast<char>(0x80 | (code & 0x3F));
+        if (code < 0x80) return {static_cast<char>(code)};
+        if (code < 0x800) return {static_cast<char>(0xC0 | code >> 6), last};
+        return {static_cast<char>(0xE0 | code >> 12), static_cast<char>(0x80 | (code >> 6 & 0x3F)), last};
+    }
+    std::string string() {
+        need('"');
+        std::string out;
+        while (true) {
+            if (at >= file.size() || static_cast<uint8_t>(file[at]) < 0x20) expected("the end of a string");
+            const char c = file[at++];
+            if (c == '"') return out;
+            if (c != '\\') {
+                out += c;
+                continue;
+            }
+            const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
+            if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
+            out += which == 8 ? unicode_escape() : std::string(1, "\"\\/\b\f\n\r\t"[which]);
+        }
+    }
+    uint64_t integer() {
+        skip_space();
+        uint64_t value = 0;
+        const char* begin = file.data() + at;
+        const auto [end, error] = std::from_chars(begin, file.data() + file.size(), value);
+        if (error != std::errc()) expected("a whole number from 0 to 2^64 - 1");
+        if (*begin == '0' && end - begin > 1) expected("a number without leading zeros");
+        at += static_cast<size_t>(end - begin);
+        return value;
+    }
+    Shape integers() {
+        Shape out;
+        need('[');
+        if (take(']')) return out;
+        do out.push_back(integer());
+        while (take(','));
+        need(']');
+        return out;
+    }
+    // Calls member(key) with the reader at each value; it returns false if the key came before.
+    template <class Member>
+    void object(const Member& member) {
+        need('{');
+        if (take('}')) return;
+        do {
+            const std::string key = string();
+            need(':');
+            if (!member(key))
+                fail("safetensors.duplicate_name", "%s: offset %zu: the name %s came before", path.c_str(), at,
+                     json_string(key.substr(0, 80)).c_str());
+        } while (take(','));
+        need('}');
+    }
+};
+
+inline DType dtype_named(const std::string& dtype, const std::string& tensor, const std::string& path) {
+    for (size_t i = 0; i < std::size(dtypes); ++i)
+        if (dtype == dtypes[i].name) return static_cast<DType>(i);
+    fail("safetensors.dtype", "%s: tensor %s has dtype %s, known are F32 F64 U8 U32 U64 I64; convert it first",
+         path.c_str(), json_string(tensor).c_str(), json_string(dtype.substr(0, 80)).c_str());
+}
+
+// {"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}
+inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
+    check_name(name, reader.path);
+    std::optional<DType> dtype;
+    std::optional<Shape> shape, offsets;
+    reader.object([&](const std::string& field) {
+        if (field == "dtype") return !std::exchange(dtype, dtype_named(reader.string(), name, reader.path));
+        if (field == "shape") return !std::exchange(shape, reader.integers());
+        if (field == "data_offsets") return !std::exchange(offsets, reader.integers());
+        reader.expected("dtype, shape or data_offsets");
+    });
+    if (!dtype || !shape || !offsets || offsets->size() != 2)
+        reader.expected("dtype, shape and two data_offsets before this");
+    const std::string where = reader.path + ": tensor " + json_string(name);
+    const size_t begin = offsets->front(), end = offsets->back();
+    if (begin > end)
+        fail("safetensors.offsets", "%s: data_offsets %zu, %zu end before they begin", where.c_str(), begin, end);
+    size_t size = 0;
+    if (!byte_size(size, *shape, *dtype) || size != end - begin)
+        fail("safetensors.shape", "%s: shape %s of %s does not fill data_offsets %zu, %zu", where.c_str(),
+             shape_text(*shape).c_str(), about(*dtype).name, begin, end);
+    return {name, *dtype, *shape, begin, size};
+}
+
+// No holes, no overlaps, nothing left over. Sorts by place: others' headers may list tensors in any order.
+inline void check_layout(TensorFile& file) {
+    std::stable_sort(file.tensors.begin(), file.tensors.end(), [](const StoredTensor& a, const StoredTensor& b) {
+        return std::pair(a.begin, a.size) < std::pair(b.begin, b.size);  // an empty tensor before the one that follows
+    });
+    const size_t available = file.buffer.size() - file.data_start;
+    size_t next = 0;
+    for (const StoredTensor& tensor : file.tensors) {
+        const std::string where = file.path + ": tensor " + json_string(tensor.name);
+        if (tensor.begin != next)
+            fail("safetensors.offsets", "%s: begins at data offset %zu, expected %zu: %s", where.c_str(), tensor.begin,
+                 next, tensor.begin < next ? "tensors overlap" : "there is a hole");
+        if (tensor.size > available - next)
+            fail("safetensors.truncated", "%s: needs %zu bytes of data, %zu are left; the file was cut off",
+                 where.c_str(), tensor.size, available - next);
+        next += tensor.size;
+    }
+    if (next != available)
+        fail("safetensors.trailing", "%s: %zu bytes follow the last tensor; the file is damaged", file.path.c_str(),
+             available - next);
+}
+
+// Checks and removes our two metadata entries.
+inline void check_checksums(TensorFile& file) {
+    const auto stored = file.metadata.extract("crc32.header"), tensors = file.metadata.extract("crc32.tensors");
+    if (!stored && !tensors) return;
+    const std::string_view start = std::string_view(file.buffer).substr(0, file.data_start);
+    const bool complete = stored && tensors && start.substr(8).starts_with(header_start) &&
+                          tensors.mapped().size() == 8 * file.tensors.size();
+    if (!complete || start.substr(crc_at, 8) != header_checksum(start))
+        fail("safetensors.checksum",
+             "%s: the header does not match its checksum; the file is damaged (a program that rewrites our files must "
+             "drop the metadata entries crc32.header and crc32.tensors)",
+             file.path.c_str());
+    for (size_t i = 0; i < file.tensors.size(); ++i) {
+        const std::string found = hex8(crc32(file.bytes(file.tensors[i])));
+        const std::string expected = tensors.mapped().substr(8 * i, 8);
+        if (found != expected)
+            fail("safetensors.checksum",
+                 "%s: tensor %s has CRC-32 %s, expected %s; the file is damaged, use another copy", file.path.c_str(),
+                 json_string(file.tensors[i].name).c_str(), found.c_str(), expected.c_str());
+    }
+}
+
+inline TensorFile parse_safetensors(std::string bytes, const std::string& path) {
+    TensorFile file;
+    file.path = path;
+    file.buffer = std::move(bytes);
+    size_t length = 0;
+    const size_t size = file.buffer.size();
+    if (size < 8) fail("safetensors.truncated", "%s: %zu bytes are too few for a header length", path.c_str(), size);
+    std::memcpy(&length, file.buffer.data(), 8);
+    if (length > header_limit)
+        fail("safetensors.header_length", "%s: offset 0: header length %zu is above %zu; not a safetensors file?",
+             path.c_str(), length, header_limit);
+    if (length > size - 8)
+        fail("safetensors.truncated", "%s: the header should have %zu bytes, %zu follow; the file was cut off",
+             path.c_str(), length, size - 8);
+    file.data_start = 8 + length;
+
+    HeaderReader reader{std::string_view(file.buffer).substr(0, file.data_start), path};
+    if (!is_utf8(reader.file.substr(8))) reader.expected("a header in UTF-8");
+    reader.object([&](const std::string& name) {
+        if (name != "__metadata__")
+            file.tensors.push_back(read_entry(reader, name));
+        else
+            reader.object([&](const std::string& key) { return file.metadata.emplace(key, reader.string()).second; });
+        return file.index.emplace(name, 0).second;
+    });
+    reader.skip_space();
+    if (reader.at != file.data_start) reader.expected("spaces up to the end of the header");
+
+    check_layout(file);
+    check_checksums(file);
+    file.index.clear();  // it knew names only, no places
+    for (size_t i = 0; i < file.tensors.size(); ++i) file.index.emplace(file.tensors[i].name, i);
+    return file;
+}
+
+inline TensorFile read_safetensors(const std::string& path) { return parse_safetensors(read_file(path), path); }

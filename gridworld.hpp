@@ -1,0 +1,240 @@
+// gridworld.hpp: the 6x6 grid world, the policy that collects its offline data, and that policy's exact statistics.
+//
+// WODTEM sec. IV-A, V-D and fig. 1a. The agent walks from the top-left cell S to the bottom-right cell G by eight
+// moves, in at most 100 steps; arriving at G pays 1 and ends the episode, every other step pays 0. The shortest path
+// has 5 steps. The paper does not say what a move off the grid does or how a state is encoded, and under none of the
+// four edge rules below can the behaviour policy it states have collected the data set it describes (the numbers are
+// at chain_statistics). Each reading is a setting; the defaults agree with the printed statistics.
+// Promises: all chance is integers drawn by counter, so a seed is the same data set on every machine; what is not a
+// move is an error. Leaves out: the time limit, which the caller of step() counts; returns (memory.hpp); networks.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "memory.hpp"
+#include "nn.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What every environment of the project offers: spec(), reset() and step() with these two records.
+
+struct EnvironmentSpec {
+    int state_dim;          // floats per state
+    int action_dim;         // floats per stored action; a discrete action is one float, the index of the move
+    int moves;              // number of discrete actions; 0: actions are continuous
+    int max_episode_steps;  // the time limit, in steps
+};
+
+struct Step {
+    double reward;
+    bool terminated;  // the task ended the episode; running into the time limit is not termination
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Cells and moves. A cell is numbered row * 6 + column; rows grow downwards, columns to the right.
+
+constexpr int grid_size = 6;
+constexpr int grid_cells = grid_size * grid_size;
+constexpr int grid_start = 0;              // S, (0, 0)
+constexpr int grid_goal = grid_cells - 1;  // G, (5, 5)
+constexpr int grid_max_steps = 100;
+
+struct GridMove {
+    const char* name;
+    const char* long_name;
+    int row_change, column_change;
+};
+
+constexpr int grid_moves = 8;
+constexpr std::array<GridMove, grid_moves> grid_move_table{{
+    // the order of WODTEM sec. IV-A; an action is an index into it
+    {"R", "right", 0, 1},
+    {"D", "down", 1, 0},
+    {"L", "left", 0, -1},
+    {"U", "up", -1, 0},
+    {"R-D", "right-down", 1, 1},
+    {"R-U", "right-up", -1, 1},
+    {"L-D", "left-down", 1, -1},
+    {"L-U", "left-up", -1, -1},
+}};
+constexpr int move_right = 0, move_down = 1, move_left = 2;
+
+// What a move off the grid does; the paper does not say.
+enum class EdgeRule {
+    clipped,   // the part that leaves is dropped, the other part happens: a diagonal slides along the wall
+    stays,     // the whole move is void
+    wraps,     // the grid is a torus; then S and G touch and the shortest path has 1 step, so not the paper's grid
+    excluded,  // the behaviour policy never chooses one; should another policy do so, the move is void
+};
+constexpr std::array<const char*, 4> edge_rule_names{"clipped", "stays", "wraps", "excluded"};
+
+inline bool leaves_grid(int cell, int move) {
+    const int row = cell / grid_size + grid_move_table[move].row_change;
+    const int column = cell % grid_size + grid_move_table[move].column_change;
+    return row < 0 || row >= grid_size || column < 0 || column >= grid_size;
+}
+
+inline int next_cell(EdgeRule edge, int cell, int move) {
+    if ((edge == EdgeRule::stays || edge == EdgeRule::excluded) && leaves_grid(cell, move)) return cell;
+    const auto onto_grid = [edge](int x) {  // x in [-1, 6]
+        return edge == EdgeRule::wraps ? (x + grid_size) % grid_size : std::clamp(x, 0, grid_size - 1);
+    };
+    return onto_grid(cell / grid_size + grid_move_table[move].row_change) * grid_size +
+           onto_grid(cell % grid_size + grid_move_table[move].column_change);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The environment.
+
+enum class StateEncoding {
+    coordinates,  // [2]: row, column, each 0 to 5
+    one_hot,      // [36]: 1 at the cell's number
+};
+constexpr std::array<const char*, 2> state_encoding_names{"coordinates", "one_hot"};
+
+struct GridWorld {
+    EdgeRule edge = EdgeRule::clipped;
+    StateEncoding encoding = StateEncoding::coordinates;
+    int cell = grid_start;  // all that changes during an episode
+
+    EnvironmentSpec spec() const {
+        return {encoding == StateEncoding::one_hot ? grid_cells : 2, 1, grid_moves, grid_max_steps};
+    }
+
+    // state [state_dim]. Every episode starts at S, so neither argument is used; other environments draw from them.
+    void reset(const Random& /*environment*/, uint64_t /*episode*/, float* state) {
+        cell = grid_start;
+        observe(state);
+    }
+
+    // action [1]: the index of a move; state [state_dim]: where it led. Not to be called after termination.
+    Step step(const float* action, float* state) {
+        const float move = *action;
+        if (!(move >= 0 && move < grid_moves && move == std::floor(move)))  // written so that NaN fails
+            fail("gridworld.bad_action", "grid world: a move is a whole number from 0 to %d, got %g", grid_moves - 1,
+                 static_cast<double>(move));
+        if (cell == grid_goal) fail("gridworld.episode_over", "grid world: step() at the goal; call reset() first");
+        cell = next_cell(edge, cell, static_cast<int>(move));
+        observe(state);
+        return {cell == grid_goal ? 1.0 : 0.0, cell == grid_goal};
+    }
+
+    void observe(float* state) const {
+        if (encoding == StateEncoding::one_hot) {
+            std::fill_n(state, grid_cells, 0.0f);
+            state[cell] = 1;
+        } else {
+            state[0] = static_cast<float>(cell / grid_size);
+            state[1] = static_cast<float>(cell % grid_size);
+        }
+    }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The behaviour policy and the offline data set.
+
+// WODTEM sec. IV-A: 20% to each of two moves, 10% to each of the six others.
+enum class Behaviour {
+    right_down,  // departs from WODTEM sec. IV-A ("left" and "down"): see chain_statistics() for the reason
+    left_down,   // the paper's words
+};
+constexpr std::array<const char*, 2> behaviour_names{"right_down", "left_down"};
+
+// Probabilities as integers: a move has weight / (sum of the weights). The sum is 10 unless moves are excluded.
+inline std::array<int, grid_moves> behaviour_weights(Behaviour behaviour, EdgeRule edge, int cell) {
+    const int sideways = behaviour == Behaviour::right_down ? move_right : move_left;
+    std::array<int, grid_moves> weights;
+    for (int move = 0; move < grid_moves; ++move) {
+        const bool available = edge != EdgeRule::excluded || !leaves_grid(cell, move);
+        weights[move] = !available ? 0 : move == sideways || move == move_down ? 2 : 1;
+    }
+    return weights;
+}
+
+inline int weight_sum(const std::array<int, grid_moves>& weights) {
+    int sum = 0;
+    for (int weight : weights) sum += weight;
+    return sum;
+}
+
+// The move whose share of [0, sum of the weights) contains the draw.
+inline int draw_move(const std::array<int, grid_moves>& weights, const Random& random, uint64_t trajectory, int time) {
+    int draw = static_cast<int>(random.below(weight_sum(weights), trajectory, time));
+    int move = 0;
+    while (draw >= weights[move]) draw -= weights[move++];
+    return move;
+}
+
+// One episode of the behaviour policy, cut at the time limit.
+inline Trajectory collect_trajectory(GridWorld world, Behaviour behaviour, uint32_t seed, uint64_t number) {
+    const EnvironmentSpec spec = world.spec();
+    Trajectory trajectory;
+    trajectory.terminated = false;
+    std::vector<float> state(spec.state_dim);
+    world.reset(Random{seed, Stream::environment}, number, state.data());
+    for (int time = 0; time < spec.max_episode_steps && !trajectory.terminated; ++time) {
+        const auto weights = behaviour_weights(behaviour, world.edge, world.cell);
+        const float action = static_cast<float>(draw_move(weights, Random{seed, Stream::data_set}, number, time));
+        trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
+        trajectory.actions.push_back(action);
+        const Step step = world.step(&action, state.data());
+        trajectory.rewards.push_back(static_cast<float>(step.reward));
+        trajectory.terminated = step.terminated;
+    }
+    return trajectory;
+}
+
+// WODTEM sec. IV-A: mean length 47.50, mean return 0.91. The first seed from 0 upwards whose 500 trajectories under
+// right_down and clipped have exactly these means: 23750 steps, 455 arrivals. (A typical seed: 49.8 and 0.88.)
+constexpr uint32_t default_data_seed = 138129;
+
+// WODTEM sec. IV-A: 500 trajectories.
+inline std::vector<Trajectory> collect_data_set(const GridWorld& world, Behaviour behaviour, uint32_t seed,
+                                                int trajectories = 500) {
+    std::vector<Trajectory> data_set;
+    for (int number = 0; number < trajectories; ++number)
+        data_set.push_back(collect_trajectory(world, behaviour, seed, number));
+    return data_set;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What the behaviour policy gives on average, without sampling.
+
+struct ChainStatistics {
+    double mean_length, sd_length;  // steps per trajectory
+    double mean_return, sd_return;  // reward per trajectory: the share that reaches G within the limit
+};
+
+// Under the behaviour policy an episode is a Markov chain on the 36 cells. With p_t the distribution over cells after t
+// steps (p_0: all at S; p_t = p_0 times the t-th power of the transition matrix, G absorbing) and s_t = 1 - p_t[G] the
+// chance to be on the way still, the length l of a trajectory, cut at 100, has
+//   E[l] = sum of s_t over t < 100,   E[l^2] = sum of (2t + 1) s_t over t < 100,   E[return] = p_100[G].
+// Mean length / return:    clipped         stays           wraps           excluded
+//   right_down             49.81 / 0.884   54.89 / 0.840   35.37 / 0.919   45.38 / 0.914
+//   left_down              78.81 / 0.455   85.08 / 0.335   33.36 / 0.924   78.44 / 0.452
+// Over data sets of 500 trajectories these means scatter by 1.1 to 1.4 steps and 0.012 to 0.022 (one standard
+// deviation). The paper's 47.50 / 0.91 is within two of right_down with clipped or excluded, more than eight in length
+// from every left_down, and more than five in length from the two others. The statistics cannot tell clipped from
+// excluded; clipped is the default because sec. IV-A states one distribution for all cells.
+inline ChainStatistics chain_statistics(Behaviour behaviour, EdgeRule edge) {
+    std::array<double, grid_cells> p{};  // p_t
+    p[grid_start] = 1;
+    double mean = 0, mean_square = 0;
+    for (int t = 0; t < grid_max_steps; ++t) {
+        mean += 1 - p[grid_goal];
+        mean_square += (2 * t + 1) * (1 - p[grid_goal]);
+        std::array<double, grid_cells> next{};  // p_(t+1)
+        next[grid_goal] = p[grid_goal];
+        for (int cell = 0; cell < grid_goal; ++cell) {
+            const auto weights = behaviour_weights(behaviour, edge, cell);
+            for (int move = 0; move < grid_moves; ++move)
+                next[next_cell(edge, cell, move)] += p[cell] * weights[move] / weight_sum(weights);
+        }
+        p = next;
+    }
+    const double success = p[grid_goal];  // the return is 0 or 1, so its variance is success (1 - success)
+    return {mean, std::sqrt(mean_square - mean * mean), success, std::sqrt(success * (1 - success))};
+}

@@ -1,0 +1,443 @@
+// test_data.cpp: data/safetensors.hpp against a file written by hand, published checksums and damage of every kind;
+// data/figures.hpp for well-formed XML, honest numbers and tables that name the line they stumble over.
+#include <sys/resource.h>
+#include <sys/wait.h>
+
+#include <csignal>
+#include <filesystem>
+
+#include "../data/figures.hpp"
+#include "../data/safetensors.hpp"
+#include "test.hpp"
+
+namespace {
+
+// A folder of this test program, removed at its end.
+struct Folder {
+    std::filesystem::path path = std::filesystem::temp_directory_path() / ("wodtem_test_" + std::to_string(::getpid()));
+    Folder() { std::filesystem::create_directories(path); }
+    ~Folder() { std::filesystem::remove_all(path); }
+    std::string operator/(const std::string& name) const { return (path / name).string(); }
+};
+
+// The eight bytes of a length, then the header, then the data: nothing of ours is used.
+std::string raw_file(const std::string& header, const std::string& data) {
+    std::string bytes;
+    for (int i = 0; i < 8; ++i) bytes += static_cast<char>(header.size() >> (8 * i) & 255);
+    return bytes + header + data;
+}
+
+std::string entry(const std::string& dtype, const std::string& shape, const std::string& offsets) {
+    return "{\"dtype\":\"" + dtype + "\",\"shape\":" + shape + ",\"data_offsets\":" + offsets + "}";
+}
+
+TensorFile small_file() {
+    TensorFile file;
+    file.metadata["config"] = "{\"K\": 20}\n\t\\ \u00e9";
+    file.metadata["format"] = "pt";
+    file.add("weight", {2, 3}, std::vector<float>{1, -2, 3, 0.5f, 0, 1e30f});
+    file.add("mask", {3}, std::vector<uint8_t>{1, 0, 255});
+    file.add("empty", {0, 7}, std::vector<double>{});
+    file.add("step", {}, std::array{uint64_t{1} << 60});
+    file.add("delta", {1}, std::array{int64_t{-5}});
+    file.add("count", {1, 1}, std::array{uint32_t{7}});
+    return file;
+}
+
+TensorFile parse(const std::string& bytes) { return parse_safetensors(bytes, "test"); }
+
+}  // namespace
+
+TEST(crc32_gives_the_published_check_value) {
+    CHECK_EQUAL(crc32("123456789"), 0xCBF43926u);  // the "check" value of CRC-32/ISO-HDLC
+    CHECK_EQUAL(crc32(""), 0u);
+    CHECK_EQUAL(crc32(std::string(32, '\0')), 0x190A55ADu);  // zlib.crc32(bytes(32))
+}
+
+TEST(crc32_of_parts_equals_crc32_of_the_whole) {
+    std::string text;
+    for (int i = 0; i < 100; ++i) text += static_cast<char>(i * 37 % 251);
+    for (size_t cut = 0; cut <= text.size(); ++cut)
+        CHECK_EQUAL(crc32(text.substr(cut), crc32(text.substr(0, cut))), crc32(text));
+}
+
+TEST(safetensors_written_by_hand_is_read) {
+    // As others write it: no checksums, other order than the data, white space, escapes.
+    const std::string header = "{ \"b\\u00e9\\n\" :" + entry("U8", "[ 2 ]", "[4, 6]") +
+                               ",\n\"a\":" + entry("F32", "[]", "[0,4]") +
+                               ",\"__metadata__\":{\"k\":\"\\\"\\\\\\/\\u20AC\"}}   ";
+    CHECK_FAILS("safetensors.name", parse(raw_file(header, "")));  // a line break in a name
+    std::string good = header;
+    good.replace(good.find("\\n"), 2, "");
+    const TensorFile file = parse(raw_file(good, std::string("\0\0\xC0\x3F", 4) + "xy"));
+    CHECK_EQUAL(file.tensors.size(), size_t{2});
+    CHECK_EQUAL(file.tensors[0].name, "a");
+    CHECK_EQUAL(file.get<float>("a", {})[0], 1.5f);
+    CHECK_EQUAL(file.get<uint8_t>("b\u00e9", {2})[1], 'y');
+    CHECK_EQUAL(file.text("k"), "\"\\/\u20ac");
+    CHECK(parse(raw_file("{}", "")).tensors.empty());
+}
+
+TEST(safetensors_round_trip_gives_the_same_bytes) {
+    const TensorFile file = small_file();
+    const std::string bytes = serialise_safetensors(file);
+    const TensorFile again = parse(bytes);
+    CHECK(serialise_safetensors(again) == bytes);
+    CHECK(again.metadata == file.metadata);
+    CHECK_EQUAL(file.data_start, size_t{0});
+    CHECK_EQUAL(again.data_start % 8, size_t{0});
+    CHECK(again.get<float>("weight", {2, 3}) == (std::vector<float>{1, -2, 3, 0.5f, 0, 1e30f}));
+    CHECK(again.get<double>("empty", {0, 7}).empty());
+    CHECK_EQUAL(again.get<uint64_t>("step", {})[0], uint64_t{1} << 60);
+    CHECK_EQUAL(again.get<int64_t>("delta", {1})[0], -5);
+    CHECK_EQUAL(again.get<uint32_t>("count", {1, 1})[0], 7u);
+    CHECK(again.has("mask") && !again.has("musk"));
+    CHECK(serialise_safetensors(parse(serialise_safetensors({}))) == serialise_safetensors({}));
+}
+
+TEST(safetensors_get_names_what_is_wrong) {
+    const TensorFile file = parse(serialise_safetensors(small_file()));
+    CHECK_FAILS("safetensors.missing", file.get<float>("bias", {3}));
+    CHECK_FAILS("safetensors.missing", file.text("seed"));
+    CHECK_FAILS("safetensors.dtype", file.get<double>("weight", {2, 3}));
+    CHECK_FAILS("safetensors.shape", file.get<float>("weight", {3, 2}));
+    std::vector<float> five(5);
+    CHECK_FAILS("safetensors.shape", file.read_into(std::span(five), "weight", {2, 3}));
+    try {
+        file.get<float>("weight", {6});
+    } catch (const Error& error) {
+        CHECK_EQUAL(std::string(error.what()),
+                    "test: tensor \"weight\" has shape [2, 3], expected [6] (6 elements); made with other settings?");
+    }
+}
+
+TEST(safetensors_refuses_what_it_could_not_read_back) {
+    TensorFile file;
+    file.add("a", {1}, std::array{1.0f});
+    CHECK_FAILS("safetensors.duplicate_name", file.add("a", {1}, std::array{1.0f}));
+    CHECK_FAILS("safetensors.shape", file.add("b", {2}, std::array{1.0f}));
+    CHECK_FAILS("safetensors.shape", file.add("b", {1ull << 63, 4, 0}, std::vector<float>{}));
+    CHECK_FAILS("safetensors.name", file.add("b\x1b[2J", {1}, std::array{1.0f}));
+    CHECK_FAILS("safetensors.name", file.add("__metadata__", {1}, std::array{1.0f}));
+    for (const char* text : {"\xff", "\xc0\xaf", "\xed\xa0\x80", "\xf4\x90\x80\x80", "\xe2\x82"}) {  // not UTF-8
+        file.metadata["path"] = text;
+        CHECK_FAILS("safetensors.metadata", serialise_safetensors(file));
+    }
+    file.metadata = {{"crc32.header", "00000000"}};
+    CHECK_FAILS("safetensors.metadata", serialise_safetensors(file));
+    file.metadata = {{"path", "\u00e9\u20ac\U0001f600"}};
+    CHECK_EQUAL(parse(serialise_safetensors(file)).text("path"), "\u00e9\u20ac\U0001f600");
+}
+
+TEST(safetensors_refuses_every_truncation) {
+    const std::string bytes = serialise_safetensors(small_file());
+    for (size_t size = 0; size < bytes.size(); ++size)
+        CHECK_FAILS("safetensors.truncated", parse(bytes.substr(0, size)));
+    CHECK_FAILS("safetensors.trailing", parse(bytes + '\0'));
+}
+
+TEST(safetensors_refuses_every_flipped_bit) {
+    for (const TensorFile& file : {small_file(), TensorFile{}}) {
+        std::string bytes = serialise_safetensors(file);
+        for (size_t bit = 0; bit < 8 * bytes.size(); ++bit) {
+            bytes[bit / 8] = static_cast<char>(bytes[bit / 8] ^ (1 << bit % 8));
+            bool refused = false;
+            try {
+                parse(bytes);
+            } catch (const Error&) {
+                refused = true;
+            }
+            if (!refused) report_failure(__FILE__, __LINE__, "accepted with bit " + std::to_string(bit) + " flipped");
+            bytes[bit / 8] = static_cast<char>(bytes[bit / 8] ^ (1 << bit % 8));
+        }
+    }
+}
+
+TEST(safetensors_never_crashes_on_damaged_bytes) {
+    // Checksums would hide the parser: a header without them, with 1 to 4 bytes replaced by likely ones.
+    const std::string header = "{\"__metadata__\":{\"k\":\"\\u00e9\\n\"},\"a\":" + entry("F32", "[2,1]", "[0,8]") +
+                               ",\"b\":" + entry("U8", "[0]", "[8,8]") + "}";
+    const std::string good = raw_file(header, "12345678"), likely = "{}[]\",:\\u0129 eF\xff\x7f";
+    const Random random{test_seed(), Stream::data_set};
+    int accepted = 0;
+    for (uint32_t round = 0; round < 20000; ++round) {
+        std::string bytes = good;
+        for (uint32_t i = 0; i <= round % 4; ++i)
+            bytes[random.below(bytes.size(), round, 2 * i)] = likely[random.below(likely.size(), round, 2 * i + 1)];
+        try {
+            serialise_safetensors(parse(bytes));
+            ++accepted;
+        } catch (const Error&) {
+        }
+    }
+    CHECK(accepted > 0 && accepted < 20000);
+}
+
+TEST(safetensors_names_each_way_a_header_can_be_wrong) {
+    const std::string a = "\"a\":" + entry("U8", "[4]", "[0,4]");
+    const struct {
+        const char* id;
+        std::string header;
+    } cases[] = {
+        {"safetensors.json", ""},
+        {"safetensors.json", "[]"},
+        {"safetensors.json", "{" + a},
+        {"safetensors.json", "{" + a + ",}"},
+        {"safetensors.json", "{" + a + "} x"},
+        {"safetensors.json", "{\"\xff\":1}"},
+        {"safetensors.json", "{\"a\tb\":1}"},
+        {"safetensors.json", "{\"\\x\":1}"},
+        {"safetensors.json", "{\"\\ud800\":1}"},
+        {"safetensors.json", "{\"\\u00g0\":1}"},
+        {"safetensors.json", "{\"\\u00"},
+        {"safetensors.json", "{\"__metadata__\":{\"k\":1}}"},
+        {"safetensors.json", "{\"a\":" + std::string(100000, '[')},
+        {"safetensors.json", "{\"a\":{\"dtype\":\"U8\",\"shape\":[4]}}"},
+        {"safetensors.json", "{\"a\":{\"dtype\":\"U8\",\"shape\":[4],\"data_offsets\":[0,4],\"more\":1}}"},
+        {"safetensors.json", "{\"a\":" + entry("U8", "[4]", "[0,2,4]") + "}"},
+        {"safetensors.json", "{\"a\":" + entry("U8", "[-4]", "[0,4]") + "}"},
+        {"safetensors.json", "{\"a\":" + entry("U8", "[4.0]", "[0,4]") + "}"},
+        {"safetensors.json", "{\"a\":" + entry("U8", "[04]", "[0,4]") + "}"},
+        {"safetensors.json", "{\"a\":" + entry("U8", "[18446744073709551616]", "[0,4]") + "}"},
+        {"safetensors.duplicate_name", "{" + a + "," + a + "}"},
+        {"safetensors.duplicate_name", "{\"__metadata__\":{},\"__metadata__\":{}," + a + "}"},
+        {"safetensors.duplicate_name", "{\"__metadata__\":{\"k\":\"1\",\"\\u006b\":\"2\"}," + a + "}"},
+        {"safetensors.duplicate_name", "{\"a\":{\"dtype\":\"U8\",\"dtype\":\"U8\"}}"},
+        {"safetensors.name", "{\"a\\u001b\":" + entry("U8", "[4]", "[0,4]") + "}"},
+        {"safetensors.dtype", "{\"a\":" + entry("F16", "[2]", "[0,4]") + "}"},
+        {"safetensors.shape", "{\"a\":" + entry("U8", "[3]", "[0,4]") + "}"},
+        {"safetensors.shape", "{\"a\":" + entry("F32", "[4]", "[0,4]") + "}"},
+        {"safetensors.shape", "{\"a\":" + entry("F32", "[4611686018427387905]", "[0,4]") + "}"},  // 2^62 + 1, times 4
+        {"safetensors.offsets", "{\"a\":" + entry("U8", "[4]", "[4,0]") + "}"},
+        {"safetensors.offsets", "{" + a + ",\"b\":" + entry("U8", "[2]", "[2,4]") + "}"},
+        {"safetensors.offsets", "{\"a\":" + entry("U8", "[2]", "[2,4]") + "}"},
+        {"safetensors.truncated", "{\"a\":" + entry("U8", "[5]", "[0,5]") + "}"},
+        {"safetensors.trailing", "{\"a\":" + entry("U8", "[3]", "[0,3]") + "}"},
+        {"safetensors.checksum", "{\"__metadata__\":{\"crc32.tensors\":\"9be3e0a3\"}," + a + "}"},
+        {"safetensors.checksum", "{\"__metadata__\":{\"crc32.header\":\"00000000\"}," + a + "}"},
+    };
+    for (const auto& [id, header] : cases) CHECK_FAILS(id, parse(raw_file(header, "1234")));
+    CHECK_FAILS("safetensors.header_length", parse("\xff\xff\xff\xff\xff\xff\xff\x7f{}"));
+    CHECK_FAILS("safetensors.truncated", parse(std::string("\x10\0\0\0\0\0\0\0{}", 10)));
+}
+
+TEST(file_is_written_whole_or_not_at_all) {
+    const Folder folder;
+    const std::string path = folder / "model.safetensors";
+    write_safetensors(path, small_file());
+    CHECK(read_file(path) == serialise_safetensors(small_file()));
+    CHECK_EQUAL(read_safetensors(path).path, path);
+    write_file_atomic(path, "old");
+
+    // A full disk: files may have 4096 bytes. In a child, since a limit once lowered may not be raised again.
+    const pid_t child = ::fork();
+    if (child == 0) {
+        std::signal(SIGXFSZ, SIG_IGN);
+        const rlimit limit{4096, 4096};
+        ::setrlimit(RLIMIT_FSIZE, &limit);
+        try {
+            write_file_atomic(path, std::string(10000, 'x'));
+        } catch (const Error& error) {
+            ::_exit(error.id == "file.write" && error.what() == path + ".tmp: cannot write it: File too large" ? 7 : 1);
+        }
+        ::_exit(0);
+    }
+    int status = 0;
+    CHECK(::waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 7);
+    CHECK_EQUAL(read_file(path), "old");
+    CHECK(!std::filesystem::exists(path + ".tmp"));
+
+    CHECK_FAILS("file.write", write_file_atomic(folder / "missing/file", "x"));
+    std::filesystem::create_directories(folder / "taken");  // rename() onto a folder fails at the last moment
+    CHECK_FAILS("file.write", write_file_atomic(folder / "taken", "x"));
+    CHECK(!std::filesystem::exists(folder / "taken.tmp"));
+}
+
+TEST(file_reader_refuses_what_is_no_regular_file) {
+    const Folder folder;
+    CHECK_FAILS("file.open", read_file(folder / "missing"));
+    CHECK_FAILS("file.not_regular", read_file(folder.path.string()));
+    CHECK_FAILS("file.not_regular", read_file("/dev/zero"));
+    write_file_atomic(folder / "nine", "123456789");
+    CHECK_EQUAL(read_file(folder / "nine", 9), "123456789");
+    CHECK_FAILS("file.too_large", read_file(folder / "nine", 8));
+}
+
+TEST(log_continues_from_the_size_that_the_checkpoint_noted) {
+    const Folder folder;
+    const std::string path = folder / "progress.csv";
+    size_t noted = 0;
+    {
+        const AppendFile log(path);
+        log.append("step,return\n");
+        log.sync();
+        noted = log.size();
+        log.append("1000,5\n");
+    }
+    CHECK_EQUAL(read_file(path), "step,return\n1000,5\n");
+    truncate_file(path, noted);
+    AppendFile(path).append("1000,6\n");
+    CHECK_EQUAL(read_file(path), "step,return\n1000,6\n");
+    CHECK_FAILS("file.shorter", truncate_file(path, 1000));
+    CHECK_FAILS("file.open", truncate_file(folder / "missing", 0));
+    CHECK_FAILS("file.open", AppendFile(folder / "missing/log"));
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+
+namespace {
+
+// Every tag closed in order, every attribute quoted, no stray & or <: enough to tell well-formed XML from a mistake.
+bool well_formed(std::string_view xml) {
+    std::vector<std::string> open;
+    for (size_t i = 0; i < xml.size(); ++i) {
+        if (xml[i] == '&') {
+            const std::string_view rest = xml.substr(i);
+            bool entity = false;
+            for (const char* name : {"&amp;", "&lt;", "&gt;", "&quot;"}) entity = entity || rest.starts_with(name);
+            if (!entity) return false;
+        }
+        if (xml[i] != '<') continue;
+        const size_t end = xml.find('>', i);
+        if (end == std::string_view::npos) return false;
+        const std::string_view tag = xml.substr(i + 1, end - i - 1);
+        i = end;
+        const std::string name(tag.substr(0, tag.find_first_of(" \n")));
+        if (tag.find('<') != std::string_view::npos || std::count(tag.begin(), tag.end(), '"') % 2 != 0) return false;
+        if (tag[0] == '/') {
+            if (open.empty() || "/" + open.back() != name) return false;
+            open.pop_back();
+        } else if (tag[0] != '!' && tag.back() != '/') {
+            open.push_back(name);
+        }
+    }
+    return open.empty();
+}
+
+// Besides well-formed: nothing that is not a number where a number belongs, nothing fetched from elsewhere.
+void check_figure(const std::string& svg) {
+    CHECK(well_formed(svg));
+    for (const char* bad : {"nan", "inf", "e+", "href", "<script", "url("}) CHECK(svg.find(bad) == std::string::npos);
+}
+
+size_t count(const std::string& text, const std::string& part) {
+    size_t found = 0;
+    for (size_t at = text.find(part); at != std::string::npos; at = text.find(part, at + 1)) ++found;
+    return found;
+}
+
+constexpr double not_measured = std::numeric_limits<double>::quiet_NaN();
+
+}  // namespace
+
+TEST(ticks_are_round_and_cover_the_data) {
+    const svg::Axis a = svg::linear_axis(3, 47, 5);
+    CHECK(a.ticks == (std::vector<double>{0, 10, 20, 30, 40, 50}));
+    CHECK_EQUAL(svg::linear_axis(-0.25, 0.25, 5).label(-0.2), "\u22120.2");
+    CHECK_EQUAL(svg::linear_axis(0, 20000, 5).label(20000), "20,000");
+    CHECK_EQUAL(svg::linear_axis(0, 1, 5).label(0.6000000000000001), "0.6");
+    CHECK(svg::log_axis(5, 100).ticks == (std::vector<double>{5, 10, 20, 50, 100}));
+    CHECK_EQUAL(svg::log_axis(0.01, 1000).label(0.01), "0.01");
+    CHECK_EQUAL(svg::log_axis(0.01, 1000).label(1000), "1,000");
+    // Hostile ranges: nothing, zero, denormal, one value, two that differ in the last bit.
+    for (const auto& [low, high] :
+         {std::pair(1.0, 0.0), {0.0, 0.0}, {1e-310, 1e-310}, {-3.0, -3.0}, {1e17, 1e17 + 16}}) {
+        const svg::Axis axis = svg::linear_axis(low, high, 5);
+        CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14 &&
+              (low > high || (axis.low <= low && axis.high >= high)));
+    }
+    const Random random{test_seed(), Stream::data_set};
+    for (uint32_t i = 0; i < 2000; ++i) {
+        const double scale = std::pow(10.0, 20 * random.uniform(i, 0) - 10);
+        const double x = scale * (random.uniform(i, 1) - 0.5), y = x + scale * (i % 3 == 0 ? 0 : random.uniform(i, 2));
+        for (const svg::Axis& axis : {svg::linear_axis(x, y, 5), svg::log_axis(scale, scale + (y - x))}) {
+            const double slack = 1e-9 * (axis.high - axis.low);
+            CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14);
+            CHECK(axis.log || (axis.low <= x + slack && axis.high >= y - slack));
+            CHECK(!axis.log || (axis.low <= scale && axis.high >= scale + (y - x)));
+        }
+    }
+}
+
+TEST(numbers_and_text_are_written_for_xml) {
+    CHECK_EQUAL(svg::number(-0.001), "0");
+    CHECK_EQUAL(svg::number(12.5), "12.5");
+    CHECK_EQUAL(svg::number(100), "100");
+    CHECK_EQUAL(svg::escaped("<a b=\"c\"> & \x01\u00e9"), "&lt;a b=&quot;c&quot;&gt; &amp; ?\u00e9");
+    CHECK(!well_formed("<a>") && !well_formed("<a></b>") && !well_formed("a & b") && !well_formed("<a b=\"/>"));
+}
+
+TEST(line_chart_breaks_at_missing_values) {
+    LineChart chart{"R & D <1>", "steps", "length", {}, {{"best: 5", Colour::black, 5}}};
+    chart.series.push_back(
+        {"a", Colour::blue, {0, 1, 2, 3, 4, 5, 6}, {9, 8, not_measured, not_measured, 7, not_measured, 6}, {}});
+    chart.series.push_back({"b", Colour::green, {0, 1}, {9, 1e300}, {1, not_measured}});
+    for (const bool log_y : {false, true}) {
+        chart.log_y = log_y;
+        const std::string svg = line_chart(chart);
+        check_figure(svg);
+        CHECK_EQUAL(count(svg, "<path"), size_t{4});    // 0-1, 4, 6 and the one point of b
+        CHECK_EQUAL(count(svg, "<circle"), size_t{3});  // runs of one point
+        CHECK_EQUAL(count(svg, "<polygon"), size_t{1});
+        CHECK_EQUAL(count(svg, "R &amp; D &lt;1&gt;"), size_t{2});
+        CHECK_EQUAL(line_chart(chart), svg);
+    }
+    check_figure(line_chart({"nothing yet", "x", "y", {}, {}}));
+    chart.series[0].mean.pop_back();
+    CHECK_FAILS("figure.length", line_chart(chart));
+}
+
+TEST(bar_chart_draws_one_bar_per_number) {
+    BarChart chart{"t", "x", "y", {"R", "D", "R-D"}, {{"a", Colour::blue, {1, not_measured, 70}, {0.5, 1, 2}}}};
+    const std::string svg = bar_chart(chart);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "<rect"), size_t{4});  // background, two bars, legend
+    CHECK_EQUAL(count(svg, "rotate(-45"), size_t{0});
+    chart.categories = {"a label that is far too long for its place", "D", "R-D"};
+    CHECK_EQUAL(count(bar_chart(chart), "rotate(-45"), size_t{3});
+    check_figure(bar_chart({"nothing yet", "x", "y", {}, {}}));
+    chart.series[0].deviation.pop_back();
+    CHECK_FAILS("figure.length", bar_chart(chart));
+}
+
+TEST(grid_policy_draws_one_arrow_per_action) {
+    GridPolicy policy{
+        "p",    2,      3, {{0, 1, 1}, {1, 1, 0.5}, {1, 0, not_measured}, {-1, 0, 0}, {0, 1, 7}, {0, 0, 1}},
+        {0, 0}, {1, 2}, {}};
+    policy.path = {{0, 0}, {0, 1}, {1, 2}};
+    const std::string svg = grid_policy(policy);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "<polygon"), size_t{4 + 3});  // and three in the legend
+    CHECK_EQUAL(count(svg, "#B9DAEF"), size_t{3 + 1});
+    policy.arrows.pop_back();
+    CHECK_FAILS("figure.length", grid_policy(policy));
+}
+
+TEST(page_is_one_well_formed_file) {
+    const Table table{{"method", "a|b"}, {{"<ODT>", "7"}}};
+    const std::string page =
+        html_page("A & B", {{"h", {"p < q"}, {table}, {{line_chart({"t", "x", "y", {}, {}}), "c"}}}});
+    CHECK(page.starts_with("<!DOCTYPE html>"));
+    CHECK(well_formed(page));  // the style sheet has no tags, void elements are closed
+    CHECK_EQUAL(count(page, "&lt;ODT&gt;"), size_t{1});
+    CHECK_EQUAL(markdown_table(table), "| method | a\\|b |\n| --- | --- |\n| <ODT> | 7 |\n");
+}
+
+TEST(csv_errors_name_the_line) {
+    const Table table = parse_csv("step,loss\n0,\n1000,-1.5e-3\n", "progress.csv");
+    CHECK_EQUAL(table.rows.size(), size_t{2});
+    const std::vector<double> loss = numbers(table, "loss", "progress.csv");
+    CHECK(std::isnan(loss[0]) && loss[1] == -0.0015);
+    CHECK_FAILS("csv.column", numbers(table, "los", "progress.csv"));
+    CHECK_FAILS("csv.unfinished", parse_csv("", "f"));
+    CHECK_FAILS("csv.unfinished", parse_csv("a,b\n1,2", "f"));
+    CHECK_FAILS("csv.fields", parse_csv("a,b\n1\n", "f"));
+    CHECK_FAILS("csv.character", parse_csv("a,\"b\"\n", "f"));
+    CHECK_FAILS("csv.character", parse_csv("a,b\r\n", "f"));
+    CHECK_FAILS("csv.number", numbers(parse_csv("a\n1\n2x\n", "f"), "a", "f"));
+    try {
+        parse_csv("a,b\n1,2\n1,2,3\n", "progress.csv");
+    } catch (const Error& error) {
+        CHECK_EQUAL(std::string(error.what()), "progress.csv: line 3 has 3 fields, the header has 2");
+    }
+}

@@ -1,0 +1,1577 @@
+// wodtem.cpp: weighting online decision transformer with episodic memory: the method, and the command line around it.
+//
+// In order: settings (Tables I and II, each value with its source); the agent and all training state; batches and the
+// memory's advice, eqs. (4) to (7); the objective and its two steps, eqs. (1) to (3) and (8) to (10); acting and
+// evaluation, sec. III-B; the offline and the online phase, sec. IV-B.3; the run folder; commands; main.
+// One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and the
+// online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
+// Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
+
+#include <unistd.h>
+
+#include <chrono>
+#include <csignal>
+#include <filesystem>
+#include <functional>
+#include <iostream>
+#include <map>
+#include <optional>
+#include <set>
+#include <variant>
+
+#include "data/report.hpp"
+#include "data/safetensors.hpp"
+#include "gridworld.hpp"
+#include "memory.hpp"
+#include "nn.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Settings. The initial values are the paper's grid world; `rows` below gives each one's range and source.
+
+struct Settings {
+    std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
+    int64_t seed = 0;
+
+    int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 1;
+    bool position = false;
+    double dropout = 0.1;
+
+    std::string optimizer = "lamb";
+    double learning_rate = 1e-3, weight_decay = 0, clip_norm = 0.25;
+    bool lamb_always_adapt = false;
+    int64_t warmup_updates = 10000, batch_size = 256, offline_updates = 1000, updates_per_iteration = 50;
+
+    double initial_lambda = 0.1, lambda_learning_rate = 1e-4, eta = -1;
+
+    int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
+    double g_online = 2, g_eval = 1, reward_scale = 1;
+    bool keep_lowest = false;
+
+    double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
+    int64_t K = 1, projected_dim = 0, table_size = 36;
+    std::string keys = "raw", eviction = "lfu";
+    bool exclude_self = false;
+
+    std::string behaviour = "right_down", edge = "clipped", state_encoding = "coordinates";
+    int64_t data_trajectories = 500, data_seed = default_data_seed;
+
+    std::map<std::string, std::string> source;  // of values that do not come from the table: name -> where from
+};
+
+using Field = std::variant<bool Settings::*, int64_t Settings::*, double Settings::*, std::string Settings::*>;
+
+struct SettingRow {
+    const char* name;
+    Field field;
+    double low, high;     // of numbers, inclusive
+    const char* choices;  // of words, separated by |
+    const char* source;   // of the grid world's value
+};
+
+constexpr double many = 1e9;
+inline const SettingRow setting_rows[] = {
+    {"task", &Settings::task, 0, 0, "gridworld", "command line"},
+    {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
+    {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
+    {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
+    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
+    // The network. WODTEM Table I (rows 1 to 3, 9); the rest as in ODT's code.
+    {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
+    {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
+    {"width", &Settings::width, 1, 65536, "", "WODTEM Table I: embedding dimension"},
+    {"context_length", &Settings::context_length, 1, 1000, "", "WODTEM Table I: context length C"},
+    {"eval_context", &Settings::eval_context, 1, 1000, "", "ODT's code: 5, here no longer than context_length"},
+    {"position", &Settings::position, 0, 0, "", "WODTEM Table I: position"},
+    {"dropout", &Settings::dropout, 0, 0.99, "", "ODT's code"},
+    // Optimisation of theta.
+    {"optimizer", &Settings::optimizer, 0, 0, "lamb|adamw", "ODT's code: LAMB, which is Adam at weight decay 0"},
+    {"learning_rate", &Settings::learning_rate, 0, 1, "", "WODTEM Table I: learning rate"},
+    {"weight_decay", &Settings::weight_decay, 0, 1, "", "WODTEM Table I: weight decay"},
+    {"clip_norm", &Settings::clip_norm, 0, many, "", "ODT's code; 0: none"},
+    {"lamb_always_adapt", &Settings::lamb_always_adapt, 0, 0, "", "ODT's code: no trust ratio at weight decay 0"},
+    {"warmup_updates", &Settings::warmup_updates, 0, many, "", "ODT's code: one schedule for both phases"},
+    {"batch_size", &Settings::batch_size, 1, 1e6, "", "ODT's code: windows of each update"},
+    {"offline_updates", &Settings::offline_updates, 0, many, "", "WODTEM Table I: offline training updates"},
+    {"updates_per_iteration", &Settings::updates_per_iteration, 0, many, "",
+     "WODTEM Table I: online training updates per iteration"},
+    // Optimisation of lambda.
+    {"initial_lambda", &Settings::initial_lambda, 1e-9, 1e3, "", "ODT's code"},
+    {"lambda_learning_rate", &Settings::lambda_learning_rate, 0, 1, "", "ODT's code: Adam on log lambda"},
+    {"eta", &Settings::eta, -many, many, "", "chosen: minus the number of action dimensions, as ODT's; paper: a constant"},
+    // Data and interaction.
+    {"online_steps", &Settings::online_steps, 0, many, "", "WODTEM sec. V-D: 20K; 0: offline only"},
+    {"buffer_size", &Settings::buffer_size, 1, 1e6, "", "WODTEM Table I: buffer size, trajectories"},
+    {"eval_episodes", &Settings::eval_episodes, 1, 1e6, "", "ODT's code: 10; all would be one here: nothing is random"},
+    {"eval_every", &Settings::eval_every, 1, 1e6, "", "ODT's code: online iterations (episodes) from one to the next"},
+    {"g_online", &Settings::g_online, -many, many, "", "WODTEM Table I: g_online"},
+    {"g_eval", &Settings::g_eval, -many, many, "", "WODTEM Table I: g_eval"},
+    {"reward_scale", &Settings::reward_scale, 1e-9, 1e9, "", "chosen: ODT's 0.001 would leave no signal"},
+    {"keep_lowest", &Settings::keep_lowest, 0, 0, "", "ODT's code: drops the lowest-return offline trajectory"},
+    // Episodic memory.
+    {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
+    {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},
+    {"epsilon", &Settings::epsilon, 0, many, "", "WODTEM sec. V-D: bound on the squared distance"},
+    {"tau", &Settings::tau, 1e-9, 1e9, "", "chosen: eq. (6) has none, which is 1"},
+    {"K", &Settings::K, 1, 1000, "", "WODTEM sec. V-D: neighbours"},
+    {"projected_dim", &Settings::projected_dim, 0, 64, "", "WODTEM sec. V-D: F1; 0: no projection"},
+    {"table_size", &Settings::table_size, 1, 1e8, "", "WODTEM sec. V-D: entries"},
+    {"keys", &Settings::keys, 0, 0, "raw|normalized", "chosen: WODTEM sec. IV-B.1 indexes by states"},
+    {"eviction", &Settings::eviction, 0, 0, "lfu|lru", "WODTEM sec. IV-B.1: least frequently accessed"},
+    {"exclude_self", &Settings::exclude_self, 0, 0, "", "WODTEM sec. IV-B.2: no exception is made for the state itself"},
+    // The grid world.
+    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down", "chosen: the paper's statistics rule out its words"},
+    {"edge", &Settings::edge, 0, 0, "clipped|stays|wraps|excluded", "chosen: fits the paper's statistics"},
+    {"state_encoding", &Settings::state_encoding, 0, 0, "coordinates|one_hot", "chosen: (row, column)"},
+    {"data_trajectories", &Settings::data_trajectories, 1, 1e6, "", "WODTEM sec. IV-A"},
+    {"data_seed", &Settings::data_seed, 0, 4294967295, "", "chosen: gives mean length 47.50 and return 0.91, sec. IV-A"},
+};
+
+// The number of single-letter changes from one word to the other (Levenshtein), for "did you mean".
+int edit_distance(const std::string& a, const std::string& b) {
+    std::vector<int> row(b.size() + 1);
+    for (size_t j = 0; j <= b.size(); ++j) row[j] = static_cast<int>(j);
+    for (size_t i = 1; i <= a.size(); ++i) {
+        int diagonal = row[0]++;
+        for (size_t j = 1; j <= b.size(); ++j)
+            diagonal = std::exchange(row[j], std::min({row[j] + 1, row[j - 1] + 1, diagonal + (a[i - 1] != b[j - 1])}));
+    }
+    return row[b.size()];
+}
+
+std::string nearest_name(const std::string& name, const std::vector<std::string>& names) {
+    return *std::min_element(names.begin(), names.end(), [&](const std::string& a, const std::string& b) {
+        return edit_distance(name, a) < edit_distance(name, b);
+    });
+}
+
+std::vector<std::string> split(const std::string& text, char separator) {
+    std::vector<std::string> parts(1);
+    for (const char c : text)
+        if (c == separator)
+            parts.emplace_back();
+        else
+            parts.back() += c;
+    return parts;
+}
+
+// Shortest text that reads back as the same number.
+std::string number_text(double x) {
+    char text[32];
+    const auto end = std::to_chars(text, text + sizeof text, x).ptr;
+    return {text, end};
+}
+
+std::optional<double> to_number(const std::string& text) {
+    double x = 0;
+    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), x);
+    if (error != std::errc() || end != text.data() + text.size() || !std::isfinite(x)) return std::nullopt;
+    return x;
+}
+
+const SettingRow& setting_row(const std::string& name) {
+    std::vector<std::string> names;
+    for (const SettingRow& row : setting_rows) {
+        if (name == row.name) return row;
+        names.push_back(row.name);
+    }
+    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(), nearest_name(name, names).c_str());
+}
+
+std::string setting_text(const Settings& settings, const SettingRow& row) {
+    return std::visit(
+        [&](auto field) -> std::string {
+            const auto& value = settings.*field;
+            using Value = std::decay_t<decltype(value)>;
+            if constexpr (std::is_same_v<Value, bool>) return value ? "yes" : "no";
+            if constexpr (std::is_same_v<Value, int64_t>) return std::to_string(value);
+            if constexpr (std::is_same_v<Value, double>) return number_text(value);
+            if constexpr (std::is_same_v<Value, std::string>) return value;
+        },
+        row.field);
+}
+
+// Errors: usage.setting with what is allowed.
+void set_setting(Settings& settings, const std::string& name, const std::string& text) {
+    const SettingRow& row = setting_row(name);
+    if (auto field = std::get_if<std::string Settings::*>(&row.field)) {
+        const std::vector<std::string> choices = split(row.choices, '|');
+        if (std::find(choices.begin(), choices.end(), text) == choices.end())
+            fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(), row.choices,
+                 nearest_name(text, choices).c_str());
+        settings.**field = text;
+    } else if (auto flag = std::get_if<bool Settings::*>(&row.field)) {
+        if (text != "yes" && text != "no") fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
+        settings.**flag = text == "yes";
+    } else {
+        const std::optional<double> x = to_number(text);
+        const auto whole = std::get_if<int64_t Settings::*>(&row.field);
+        const bool in_range = x && *x >= row.low && *x <= row.high && (!whole || *x == std::floor(*x));
+        if (!in_range) {
+            const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
+            fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name, text.c_str(),
+                 whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
+                 number_text(whole ? std::round(nearest) : nearest).c_str());
+        }
+        if (whole)
+            settings.**whole = static_cast<int64_t>(*x);
+        else
+            settings.*std::get<double Settings::*>(row.field) = *x;
+    }
+}
+
+// Where a value comes from: the command line, the preset, the method, or the table's source.
+void set_from(Settings& settings, const std::string& name, const std::string& text, const std::string& source) {
+    set_setting(settings, name, text);
+    settings.source[name] = source;
+}
+
+Settings default_settings(const std::string& task, const std::string& method, const std::string& preset) {
+    Settings settings;
+    set_setting(settings, "task", task);
+    set_setting(settings, "method", method);
+    set_setting(settings, "preset", preset);
+    if (preset == "small") set_from(settings, "width", "16", "preset small: everything else as in Table I");
+    if (method == "dt") {
+        set_from(settings, "online_steps", "0", "DT learns offline only");
+        set_from(settings, "initial_lambda", "1e-9", "DT has no entropy term: lambda is not used");
+    }
+    return settings;
+}
+
+void check_together(const Settings& settings) {
+    if (settings.width % settings.heads != 0)
+        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", static_cast<long long>(settings.width),
+             static_cast<long long>(settings.heads), static_cast<long long>((settings.width / settings.heads + 1) * settings.heads));
+    if (settings.eval_context > settings.context_length)
+        fail("usage.setting", "eval_context %lld is longer than the context_length %lld that is trained", static_cast<long long>(settings.eval_context),
+             static_cast<long long>(settings.context_length));
+    if (settings.online_steps > 0 && settings.method == "dt")
+        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", static_cast<long long>(settings.online_steps));
+}
+
+// name = value    # source
+std::string settings_text(const Settings& settings) {
+    std::string text;
+    for (const SettingRow& row : setting_rows) {
+        const auto source = settings.source.find(row.name);
+        std::string line = std::string(row.name) + " = " + setting_text(settings, row);
+        line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
+        text += line + "# " + (source == settings.source.end() ? row.source : source->second) + "\n";
+    }
+    return text;
+}
+
+Settings settings_from_text(const std::string& text, const std::string& path) {
+    Settings settings;
+    for (const auto& [name, value, source] : parse_settings(text, path)) set_from(settings, name, value, source);
+    return settings;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The agent, and everything else that a run must not forget.
+
+struct Normaliser {
+    std::vector<float> mean, deviation;  // [state_dim], over all offline states; fixed for the whole run
+};
+
+// ODT's code: population standard deviation + 1e-6; the dropped trajectory counts here.
+Normaliser fit_normaliser(const std::vector<Trajectory>& trajectories, int state_dim) {
+    Normaliser normaliser;
+    for (int i = 0; i < state_dim; ++i) {
+        double count = 0, sum = 0, squares = 0;
+        const auto each = [&](auto&& f) {
+            for (const Trajectory& trajectory : trajectories)
+                for (size_t at = static_cast<size_t>(i); at < trajectory.states.size(); at += static_cast<size_t>(state_dim)) f(trajectory.states[at]);
+        };
+        each([&](float x) { sum += x, ++count; });
+        const double mean = sum / count;
+        each([&](float x) { squares += (x - mean) * (x - mean); });
+        normaliser.mean.push_back(static_cast<float>(mean));
+        normaliser.deviation.push_back(static_cast<float>(std::sqrt(squares / count) + 1e-6));
+    }
+    return normaliser;
+}
+
+// What acts: the network and what stands between it and raw states.
+struct Agent {
+    Settings settings;
+    EnvironmentSpec spec;
+    Transformer<float> model;
+    Normaliser normaliser;
+};
+
+TransformerConfig transformer_config(const Settings& settings, const EnvironmentSpec& spec) {
+    TransformerConfig config;
+    config.state_dim = spec.state_dim;
+    config.action_dim = spec.moves > 0 ? spec.moves : spec.action_dim;  // a discrete action enters as a one-hot vector
+    config.layers = static_cast<int>(settings.layers);
+    config.heads = static_cast<int>(settings.heads);
+    config.width = static_cast<int>(settings.width);
+    config.max_timesteps = settings.position ? 1000 : 0;  // ODT's code: a table of 1000 rows
+    config.dropout = static_cast<float>(settings.dropout);
+    config.head = spec.moves > 0 ? Head::categorical : settings.method == "dt" ? Head::deterministic : Head::squashed_gaussian;
+    return config;
+}
+
+OptimizerConfig optimizer_config(const Settings& settings) {
+    OptimizerConfig config;
+    config.rule = settings.optimizer == "lamb" ? OptimizerConfig::Rule::lamb : OptimizerConfig::Rule::adamw;
+    config.learning_rate = settings.learning_rate;
+    config.weight_decay = settings.weight_decay;
+    config.always_adapt = settings.lamb_always_adapt;
+    config.clip_norm = settings.clip_norm;
+    config.warmup_updates = static_cast<uint64_t>(settings.warmup_updates);
+    return config;
+}
+
+MemoryConfig memory_config(const Settings& settings, const EnvironmentSpec& spec) {
+    MemoryConfig config{};
+    config.state_dim = spec.state_dim;
+    config.action_dim = spec.action_dim;
+    config.projected_dim = static_cast<int>(settings.projected_dim);
+    config.capacity = static_cast<size_t>(settings.table_size);
+    config.K = static_cast<int>(settings.K);
+    config.epsilon = settings.epsilon;
+    config.tau = settings.tau;
+    config.exclude_self = settings.exclude_self;
+    config.eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru;
+    return config;
+}
+
+// The Lagrange multiplier of eqs. (1) and (8), kept as its logarithm: so lambda >= 0 by construction. Adam, no warm-up.
+struct Temperature {
+    std::vector<Parameter<float>> log_lambda;
+    Optimizer optimizer;
+    explicit Temperature(double initial_lambda)
+        : log_lambda{{"log_temperature", {1}, {std::log(static_cast<float>(initial_lambda))}, {0}}} {}
+    float lambda() const { return std::exp(log_lambda[0].value[0]); }
+};
+
+// How far a run is, and the sums behind the next row of progress.csv.
+struct Progress {
+    uint64_t updates = 0, interactions = 0, episodes = 0, online = 0, evaluations = 0, next_evaluation = 0;
+    uint64_t progress_bytes = 0, episodes_bytes = 0;  // of the two logs
+    double loss = 0, entropy = 0, gradient_norm = 0, summed_updates = 0;
+    double pairs = 0, short_pairs = 0, unmatched_pairs = 0;
+    double rollout_length = 0, rollout_return = 0, rollouts = 0;
+    double eval_length = NAN, eval_return = NAN;
+
+    template <class Archive>
+    void visit(Archive& archive) {
+        for (auto [name, field] : std::initializer_list<std::pair<const char*, uint64_t&>>{
+                 {"progress.updates", updates}, {"progress.interactions", interactions}, {"progress.episodes", episodes},
+                 {"progress.online", online}, {"progress.evaluations", evaluations}, {"progress.next_evaluation", next_evaluation},
+                 {"progress.progress_bytes", progress_bytes}, {"progress.episodes_bytes", episodes_bytes}})
+            archive(name, field);
+        for (auto [name, field] : std::initializer_list<std::pair<const char*, double&>>{
+                 {"progress.loss", loss}, {"progress.entropy", entropy}, {"progress.gradient_norm", gradient_norm},
+                 {"progress.summed_updates", summed_updates}, {"progress.pairs", pairs}, {"progress.short_pairs", short_pairs},
+                 {"progress.unmatched_pairs", unmatched_pairs}, {"progress.rollout_length", rollout_length},
+                 {"progress.rollout_return", rollout_return}, {"progress.rollouts", rollouts}, {"progress.eval_length", eval_length},
+                 {"progress.eval_return", eval_return}})
+            archive(name, field);
+    }
+};
+
+// Training state is exactly this; whatever is not here is not state, and the checkpoint cannot forget it.
+struct Run {
+    Agent agent;
+    Optimizer optimizer;
+    Temperature temperature;
+    ReplayBuffer replay;    // D_offline in the offline phase, D_online afterwards
+    EpisodicMemory memory;  // Q
+    Progress progress;
+    Tape<float> tape;  // scratch, empty between updates
+
+    Run(Compute& compute, const Settings& settings, const EnvironmentSpec& spec)
+        : agent{settings, spec, Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed)), {}},
+          temperature(settings.initial_lambda),
+          replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
+          memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)), tape(compute) {}
+
+    Random random(Stream stream) const { return {static_cast<uint32_t>(agent.settings.seed), stream}; }
+    bool remembers() const { return agent.settings.method == "wodtem"; }
+    bool constrains_entropy() const { return agent.settings.method != "dt"; }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// From trajectories to what the network reads.
+
+void append_normalised(std::vector<float>& to, const Normaliser& normaliser, const float* state) {
+    for (size_t i = 0; i < normaliser.mean.size(); ++i) to.push_back((state[i] - normaliser.mean[i]) / normaliser.deviation[i]);
+}
+
+// Actions inside the open interval: atanh(1) is infinite. ODT's code.
+float clamp_action(float a) { return std::clamp(a, -1.0f + 1e-6f, 1.0f - 1e-6f); }
+
+void append_action_token(std::vector<float>& to, const EnvironmentSpec& spec, const float* action) {
+    if (spec.moves > 0)
+        for (int move = 0; move < spec.moves; ++move) to.push_back(static_cast<float>(*action) == static_cast<float>(move) ? 1.0f : 0.0f);
+    else
+        for (int i = 0; i < spec.action_dim; ++i) to.push_back(clamp_action(action[i]));
+}
+
+void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const float* action) {
+    for (int i = 0; i < spec.action_dim; ++i) to.push_back(spec.moves > 0 ? action[i] : clamp_action(action[i]));
+}
+
+// One update's data: n steps of batch_size windows, packed.
+struct Batch {
+    SequenceBatch sequences;
+    std::vector<float> actions;             // [n, action_dim] a_c
+    std::vector<float> remembered;          // [n, action_dim] a-hat(s_c)
+    std::vector<double> discounted_returns; // [n] d_c
+    std::vector<const float*> raw_states;   // [n] s_c, in the replay buffer
+    std::vector<float> mean;                // [n] 1 / (windows |C^t|): the mean over a window's steps, then over windows
+    std::vector<float> weights;             // [n] w(s_c, a_c)
+};
+
+// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t = the steps of the window.
+// departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up to t.
+Batch sample_batch(const Run& run) {
+    const Settings& settings = run.agent.settings;
+    const EnvironmentSpec& spec = run.agent.spec;
+    Batch batch;
+    for (uint32_t window = 0; window < settings.batch_size; ++window) {
+        const Window at = run.replay.sample(run.random(Stream::batch), run.progress.updates, window, static_cast<int>(settings.context_length));
+        const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
+        batch.sequences.lengths.push_back(at.length);
+        for (int t = at.start; t < at.start + at.length; ++t) {
+            const size_t step = static_cast<size_t>(t);
+            const float* state = &trajectory.states[step * static_cast<size_t>(spec.state_dim)];
+            const float* action = &trajectory.actions[step * static_cast<size_t>(spec.action_dim)];
+            batch.sequences.returns_to_go.push_back(static_cast<float>(trajectory.returns_to_go[step] * settings.reward_scale));
+            append_normalised(batch.sequences.states, run.agent.normaliser, state);
+            append_action_token(batch.sequences.actions, spec, action);
+            batch.sequences.timesteps.push_back(t);
+            append_action(batch.actions, spec, action);
+            batch.discounted_returns.push_back(trajectory.discounted_returns[step]);
+            batch.raw_states.push_back(state);
+            batch.mean.push_back(1.0f / static_cast<float>(settings.batch_size * at.length));
+        }
+    }
+    batch.remembered = batch.actions;
+    batch.weights.assign(batch.mean.size(), 1.0f);
+    return batch;
+}
+
+// The state by which the memory knows s: raw, or normalised if `keys` says so.
+std::vector<float> memory_key(const Agent& agent, const float* state) {
+    std::vector<float> key;
+    if (agent.settings.keys == "normalized")
+        append_normalised(key, agent.normaliser, state);
+    else
+        key.assign(state, state + agent.spec.state_dim);
+    return key;
+}
+
+// WODTEM sec. IV-B.1, eq. (4): the table takes in a trajectory, once, as soon as it is there.
+void remember(Run& run, Trajectory trajectory) {
+    if (!run.remembers()) return;
+    std::vector<float> keys;
+    for (size_t at = 0; at < trajectory.states.size(); at += static_cast<size_t>(run.agent.spec.state_dim)) {
+        const std::vector<float> key = memory_key(run.agent, &trajectory.states[at]);
+        keys.insert(keys.end(), key.begin(), key.end());
+    }
+    trajectory.states = std::move(keys);
+    run.memory.update(trajectory);
+}
+
+// WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each batch.
+// Without a neighbour there is nothing against a_c: w = 1.
+void consult_memory(Run& run, Batch& batch) {
+    if (!run.remembers()) return;
+    const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
+    const Random random = run.random(Stream::remembered_action);
+    for (size_t i = 0; i < batch.weights.size(); ++i) {
+        const std::vector<Neighbour> found = run.memory.neighbours(memory_key(run.agent, batch.raw_states[i]).data());
+        run.progress.unmatched_pairs += found.empty();
+        const double d = batch.discounted_returns[i];
+        batch.weights[i] = static_cast<float>(run.memory.weight(found, d, run.agent.settings.alpha));
+        if (run.memory.is_optimal(found, d)) continue;
+        run.progress.short_pairs += 1;
+        const float* action = run.memory.remembered_action(found, random.uniform(run.progress.updates, static_cast<uint32_t>(i)));
+        for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
+            batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The objective.
+
+// log pi_theta(a_c | s^c, g^c), [n, 1]; DT's deterministic head: minus the squared error.
+template <class T>
+Tensor<T> log_prob(Tape<T>& tape, Head head, const Policy<T>& policy, const float* actions) {
+    if (head == Head::categorical) return categorical_log_prob(tape, policy.mean, actions);
+    if (head == Head::squashed_gaussian) return gaussian_log_prob(tape, policy, actions);
+    const Tensor<T> error = squared_error(tape, policy.mean, actions), none = tape.make(error.rows, 1);
+    for (int i = 0; i < error.rows; ++i) none.value[i] = -error.value[i];
+    tape.on_backward([=] {
+        for (int i = 0; i < error.rows; ++i) error.gradient[i] -= none.gradient[i];
+    });
+    return none;
+}
+
+// H(pi_theta(. | s^c, g^c)), [n, 1]: exact where the policy is categorical, else by one sample with the given noise.
+template <class T>
+Tensor<T> policy_entropy(Tape<T>& tape, Head head, const Policy<T>& policy, const float* noise) {
+    if (head == Head::categorical) return categorical_entropy(tape, policy.mean);
+    return gaussian_entropy(tape, policy, noise);
+}
+
+template <class T>
+struct Objective {
+    Tensor<T> likelihood;  // L(theta), or J(theta) where all w = 1
+    Tensor<T> entropy;     // H-bar(theta)
+    Tensor<T> loss;        // what theta descends
+};
+
+// Equations (2), (3), (8) to (10) for one batch. `entropy_noise` [n, action_dim]: for the Gaussian head only.
+template <class T>
+Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const Batch& batch, const float* entropy_noise, float lambda,
+                       bool constrain_entropy) {
+    const size_t n = batch.mean.size();
+    std::vector<float> observed(n), advised(n);
+    for (size_t i = 0; i < n; ++i) {
+        observed[i] = -batch.mean[i] * batch.weights[i];
+        advised[i] = -batch.mean[i] * (1.0f - batch.weights[i]);
+    }
+    Objective<T> result;
+    // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat(s_c) | s^c, g^c) ]
+    // WODTEM eq. (2): J is L with w = 1. Both terms read the same distribution; the action tokens stay the buffer's.
+    // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over all steps.
+    result.likelihood = combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()), T(1),
+                                weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
+    if (!constrain_entropy) {
+        result.loss = result.likelihood;
+        return result;
+    }
+    // WODTEM eq. (3), WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
+    // departs from ODT's code: over real steps only; ODT's code lets padding into this mean.
+    result.entropy = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), batch.mean.data());
+    // WODTEM eq. (1), WODTEM eq. (8): theta descends L + lambda (eta - H-bar); lambda eta does not depend on theta.
+    result.loss = combine(tape, T(1), result.likelihood, T(-lambda), result.entropy);
+    return result;
+}
+
+// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar). Its gradient in log lambda is lambda (eta - H-bar).
+void update_lambda(Run& run, Compute& compute, double entropy) {
+    OptimizerConfig config;
+    config.rule = OptimizerConfig::Rule::adamw;
+    config.learning_rate = run.agent.settings.lambda_learning_rate;
+    config.weight_decay = config.clip_norm = 0;
+    config.warmup_updates = 0;
+    run.temperature.log_lambda[0].gradient[0] = static_cast<float>(-run.temperature.lambda() * (run.agent.settings.eta - entropy));
+    update_parameters(compute, run.temperature.log_lambda, run.temperature.optimizer, config);
+}
+
+// One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
+void update(Run& run) {
+    Compute& compute = run.tape.compute;
+    Tape<float>& tape = run.tape;
+    const Head head = run.agent.model.config.head;
+    tape.reset();
+    tape.recording = true;
+    tape.dropout_random = run.random(Stream::dropout);
+    tape.dropout_step = run.progress.updates;
+
+    Batch batch = sample_batch(run);
+    consult_memory(run, batch);
+    std::vector<float> noise;
+    for (uint32_t i = 0; head == Head::squashed_gaussian && i < batch.actions.size(); ++i)
+        noise.push_back(run.random(Stream::entropy_noise).normal(run.progress.updates, i));
+    const Policy<float> policy = forward(tape, run.agent.model, batch.sequences, Ask::every_state);
+    const Objective<float> result = objective(tape, head, policy, batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
+    if (!std::isfinite(result.loss.value[0])) fail("nn.not_finite", "the loss is not finite");
+    tape.backward(result.loss);
+    run.progress.gradient_norm += update_parameters(compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
+    if (run.constrains_entropy()) {
+        update_lambda(run, compute, result.entropy.value[0]);
+        run.progress.entropy += result.entropy.value[0];
+    }
+    run.progress.loss += result.likelihood.value[0];
+    run.progress.pairs += static_cast<double>(batch.mean.size());
+    run.progress.summed_updates += 1;
+    run.progress.updates += 1;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Acting. WODTEM sec. III-B.
+
+enum class Act { sample, most_likely };  // online interaction; evaluation
+
+// The action of one row of the policy, as it is stored and stepped. Random: one stream, one number per dimension.
+std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act, const Random& random, uint64_t episode,
+                                 uint32_t t) {
+    const int columns = policy.mean.columns;
+    const float* mean = policy.mean.value + static_cast<ptrdiff_t>(row) * columns;
+    std::vector<float> action;
+    if (agent.spec.moves > 0) {
+        if (act == Act::most_likely) return {static_cast<float>(std::max_element(mean, mean + columns) - mean)};  // ties: the first
+        double left = random.uniform(episode, t);
+        int move = 0;
+        while (move + 1 < columns && (left -= static_cast<double>(std::exp(mean[move]))) >= 0) ++move;
+        return {static_cast<float>(move)};
+    }
+    for (int i = 0; i < columns; ++i) {
+        const ptrdiff_t at = static_cast<ptrdiff_t>(row) * columns + i;
+        float u = mean[i];
+        if (agent.model.config.head == Head::squashed_gaussian) {
+            if (act == Act::sample) u += std::exp(policy.log_std.value[at]) * random.normal(episode, t, static_cast<uint32_t>(i));
+            u = std::tanh(u);
+        }
+        action.push_back(clamp_action(u));
+    }
+    return action;
+}
+
+// An episode under way. returns_to_go is what the agent is told: the target, less what it has received.
+struct Episode {
+    Trajectory trajectory;
+    std::vector<float> state;          // [state_dim] the present one
+    std::vector<float> returns_to_go;  // [t + 1] scaled
+    bool over = false;
+};
+
+// The latest `context` steps of every episode that goes on, the present state last.
+SequenceBatch acting_batch(const Agent& agent, const std::vector<Episode>& episodes) {
+    const size_t S = static_cast<size_t>(agent.spec.state_dim), A = static_cast<size_t>(agent.spec.action_dim);
+    SequenceBatch batch;
+    for (const Episode& episode : episodes) {
+        if (episode.over) continue;
+        const int t = episode.trajectory.length(), first = std::max(0, t + 1 - static_cast<int>(agent.settings.eval_context));
+        batch.lengths.push_back(t + 1 - first);
+        for (int c = first; c <= t; ++c) {
+            const size_t step = static_cast<size_t>(c);
+            append_normalised(batch.states, agent.normaliser, c < t ? &episode.trajectory.states[step * S] : episode.state.data());
+            batch.returns_to_go.push_back(episode.returns_to_go[step]);
+            batch.timesteps.push_back(c);
+            const std::vector<float> none(A);  // the present step has no action yet, and its token is never built
+            append_action_token(batch.actions, agent.spec, c < t ? &episode.trajectory.actions[step * A] : none.data());
+        }
+    }
+    return batch;
+}
+
+// Plays `count` episodes numbered from `first_episode` side by side, through the network as one batch.
+// WODTEM sec. III-B: g_1 = target; a_t from the policy (sampled, or the most likely one); g_{t+1} = g_t - r_t.
+template <class Environment>
+std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act, double target, uint64_t first_episode, int count) {
+    const Agent& agent = run.agent;
+    const EnvironmentSpec& spec = agent.spec;
+    std::vector<Environment> environments(static_cast<size_t>(count), prototype);
+    std::vector<Episode> episodes(static_cast<size_t>(count));
+    for (size_t i = 0; i < episodes.size(); ++i) {
+        episodes[i].state.resize(static_cast<size_t>(spec.state_dim));
+        episodes[i].returns_to_go = {static_cast<float>(target * agent.settings.reward_scale)};
+        environments[i].reset(run.random(Stream::environment), first_episode + i, episodes[i].state.data());
+    }
+    run.tape.recording = false;  // and so no dropout
+    for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps); ++t) {
+        const SequenceBatch batch = acting_batch(agent, episodes);
+        if (batch.lengths.empty()) break;
+        run.tape.reset();
+        const Policy<float> policy = forward(run.tape, agent.model, batch, Ask::last_state);
+        int row = 0;
+        for (size_t i = 0; i < episodes.size(); ++i) {
+            Episode& episode = episodes[i];
+            if (episode.over) continue;
+            const std::vector<float> action = choose_action(agent, policy, row++, act, run.random(Stream::exploration), first_episode + i, t);
+            Trajectory& trajectory = episode.trajectory;
+            trajectory.states.insert(trajectory.states.end(), episode.state.begin(), episode.state.end());
+            trajectory.actions.insert(trajectory.actions.end(), action.begin(), action.end());
+            const Step step = environments[i].step(action.data(), episode.state.data());
+            trajectory.rewards.push_back(static_cast<float>(step.reward));
+            trajectory.terminated = episode.over = step.terminated;
+            episode.returns_to_go.push_back(episode.returns_to_go.back() - static_cast<float>(step.reward * agent.settings.reward_scale));
+        }
+    }
+    std::vector<Trajectory> trajectories;
+    for (Episode& episode : episodes) {
+        relabel(episode.trajectory, spec.state_dim, spec.action_dim, agent.settings.gamma);
+        trajectories.push_back(std::move(episode.trajectory));
+    }
+    return trajectories;
+}
+
+constexpr uint64_t evaluation_episodes = uint64_t{1} << 40;  // their numbers start here, those of online episodes at 0
+
+struct Evaluation {
+    double mean_length = 0, mean_return = 0;
+    std::vector<Trajectory> episodes;
+};
+
+// WODTEM sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. `number`: of the evaluation.
+template <class Environment>
+Evaluation evaluate(Run& run, const Environment& environment, uint64_t number, int count) {
+    Evaluation result;
+    const uint64_t first = evaluation_episodes + number * static_cast<uint64_t>(count);
+    result.episodes = rollout(run, environment, Act::most_likely, run.agent.settings.g_eval, first, count);
+    for (const Trajectory& episode : result.episodes) {
+        result.mean_length += episode.length() / static_cast<double>(count);
+        result.mean_return += total_return(episode) / count;
+    }
+    return result;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The run folder: settings, progress.csv, episodes.csv, model.safetensors, and checkpoint.safetensors while it runs.
+
+namespace fs = std::filesystem;
+
+constexpr const char* progress_header =
+    "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
+    "eval_length,eval_return,eval_score,rollout_length,rollout_return\n";
+constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions\n";
+
+struct Saver {
+    static constexpr bool loading = false;
+    TensorFile& file;
+    template <class T>
+    void operator()(const std::string& name, const std::vector<T>& values) {
+        file.add(name, {values.size()}, values);
+    }
+    template <class T>
+        requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T value) {
+        file.add(name, {}, std::array{value});
+    }
+};
+
+struct Loader {
+    static constexpr bool loading = true;
+    const TensorFile& file;
+    template <class T>
+    void operator()(const std::string& name, std::vector<T>& values) {
+        const uint64_t n = file.find(name).shape.empty() ? 1 : file.find(name).shape[0];
+        values = file.get<T>(name, {n});
+    }
+    template <class T>
+        requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T& value) {
+        value = file.get<T>(name, {})[0];
+    }
+};
+
+// Everything in Run that is state, in the order of its members; saving and loading read the same list.
+template <class Archive>
+void visit_state(Archive& archive, Run& run) {
+    run.progress.visit(archive);
+    const auto optimizer = [&](const std::string& name, std::vector<Parameter<float>>& parameters, Optimizer& state) {
+        archive(name + ".updates", state.updates);
+        state.first_moment.resize(parameters.size());
+        state.second_moment.resize(parameters.size());
+        for (size_t i = 0; i < parameters.size(); ++i) {
+            for (auto [part, values] : std::initializer_list<std::pair<const char*, std::vector<float>&>>{
+                     {".value.", parameters[i].value}, {".first_moment.", state.first_moment[i]}, {".second_moment.", state.second_moment[i]}}) {
+                const size_t before = parameters[i].value.size();
+                if (!Archive::loading) values.resize(before);  // moments that no update has touched yet are zeros
+                archive(name + part + parameters[i].name, values);
+                if (values.size() != before)
+                    fail("checkpoint.shape", "%s%s%s has %zu values, expected %zu", name.c_str(), part, parameters[i].name.c_str(), values.size(), before);
+            }
+        }
+    };
+    optimizer("model", run.agent.model.parameters, run.optimizer);
+    archive("normaliser.mean", run.agent.normaliser.mean);
+    archive("normaliser.deviation", run.agent.normaliser.deviation);
+    optimizer("temperature", run.temperature.log_lambda, run.temperature.optimizer);
+    if (Archive::loading && run.progress.online == 0) run.replay.capacity = static_cast<size_t>(run.agent.settings.data_trajectories);
+    run.replay.visit(archive);
+    run.memory.visit(archive);
+}
+
+struct RunFolder {
+    std::string path;
+    std::string file(const char* name) const { return path + "/" + name; }
+};
+
+// Logs first, to the disk: the checkpoint notes how long they are.
+void save_checkpoint(Run& run, const RunFolder& folder) {
+    AppendFile(folder.file("progress.csv")).sync();
+    AppendFile(folder.file("episodes.csv")).sync();
+    TensorFile file;
+    file.metadata["format"] = "wodtem checkpoint 1";
+    file.metadata["settings"] = settings_text(run.agent.settings);
+    Saver saver{file};
+    visit_state(saver, run);
+    write_safetensors(folder.file("checkpoint.safetensors"), file);
+}
+
+// Errors name the file: a checkpoint may be damaged, or belong to another program's idea of a run.
+void load_checkpoint(Run& run, const RunFolder& folder) {
+    const std::string path = folder.file("checkpoint.safetensors");
+    const TensorFile file = read_safetensors(path);
+    try {
+        Loader loader{file};
+        visit_state(loader, run);
+    } catch (const Error& error) {
+        fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
+    }
+    truncate_file(folder.file("progress.csv"), run.progress.progress_bytes);
+    truncate_file(folder.file("episodes.csv"), run.progress.episodes_bytes);
+}
+
+// Weights under ODT's names, the temperature, the normaliser and the settings: all that `eval` needs.
+void save_model(const Run& run, const std::string& path) {
+    TensorFile file;
+    file.metadata["format"] = "wodtem model 1";
+    file.metadata["settings"] = settings_text(run.agent.settings);
+    file.metadata["updates"] = std::to_string(run.progress.updates);
+    file.metadata["interactions"] = std::to_string(run.progress.interactions);
+    for (const Parameter<float>& parameter : run.agent.model.parameters) file.add(parameter.name, parameter.shape, parameter.value);
+    const Parameter<float>& log_lambda = run.temperature.log_lambda[0];
+    file.add(log_lambda.name, {}, log_lambda.value);
+    file.add("state_mean", {run.agent.normaliser.mean.size()}, run.agent.normaliser.mean);
+    file.add("state_std", {run.agent.normaliser.deviation.size()}, run.agent.normaliser.deviation);
+    write_safetensors(path, file);
+}
+
+void load_model(Run& run, const TensorFile& file) {
+    for (Parameter<float>& parameter : run.agent.model.parameters) file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
+    const uint64_t S = static_cast<uint64_t>(run.agent.spec.state_dim);
+    run.agent.normaliser = {file.get<float>("state_mean", {S}), file.get<float>("state_std", {S})};
+    for (const Parameter<float>& parameter : run.agent.model.parameters)
+        for (const float value : parameter.value)
+            if (!std::isfinite(value)) fail("model.not_finite", "%s: tensor %s is not finite", file.path.c_str(), parameter.name.c_str());
+}
+
+std::string csv_line(const std::vector<std::string>& fields) {
+    std::string line;
+    for (const std::string& field : fields) line += (line.empty() ? "" : ",") + field;
+    return line + "\n";
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What a person sees while it runs: a bar on a terminal, a line for each tenth of the way otherwise. To stderr.
+
+struct Console {
+    using Clock = std::chrono::steady_clock;
+    const bool terminal = isatty(STDERR_FILENO) != 0;
+    Clock::time_point started = Clock::now(), shown = started - std::chrono::hours(1);
+    double first_share = -1;  // of the phase, when this process began it
+    int tenth = -1;
+    std::string label, phase;
+
+    static double seconds_between(Clock::time_point a, Clock::time_point b) { return std::chrono::duration<double>(b - a).count(); }
+
+    // share: of the phase, 0 to 1.
+    void show(const Run& run, const std::string& new_phase, double share) {
+        const Clock::time_point now = Clock::now();
+        if (phase != new_phase) phase = new_phase, first_share = share, tenth = -1, started = now;
+        const int new_tenth = static_cast<int>(share * 10);
+        if (terminal ? seconds_between(shown, now) < 0.1 && share < 1 : new_tenth == tenth) return;
+        shown = now;
+        tenth = new_tenth;
+        const Progress& p = run.progress;
+        const double elapsed = seconds_between(started, now), gained = share - first_share;
+        const double left = gained > 0 ? elapsed / gained * (1 - share) : NAN;
+        const double updates = std::max(1.0, p.summed_updates);
+        const int width = 20, filled = static_cast<int>(share * width);
+        std::string text = label + " " + phase;
+        if (terminal) text += " [" + std::string(static_cast<size_t>(filled), '#') + std::string(static_cast<size_t>(width - filled), '.') + "]";
+        char numbers[256];
+        std::snprintf(numbers, sizeof numbers, " %3.0f%%  update %llu  interactions %llu  loss %.3f  entropy %.3f  length %.4g  return %.3g  %.0f updates/s",
+                      100 * share, static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.interactions), p.loss / updates,
+                      p.entropy / updates, p.eval_length, p.eval_return, static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_between(began, now)));
+        text += numbers;
+        if (std::isfinite(left)) std::snprintf(numbers, sizeof numbers, "  %d:%02d left", static_cast<int>(left) / 60, static_cast<int>(left) % 60);
+        if (std::isfinite(left)) text += numbers;
+        std::fprintf(stderr, terminal ? "\r%s\033[K" : "%s\n", text.c_str());
+        if (terminal && share >= 1) std::fprintf(stderr, "\n");
+    }
+
+    Clock::time_point began = Clock::now();
+    uint64_t first_update = 0;
+};
+
+volatile std::sig_atomic_t stop_requested = 0;
+
+// What a phase needs besides the state: where to write, and whom to tell.
+template <class Environment>
+struct Session {
+    Environment environment;
+    RunFolder folder;
+    Console console;
+    double checkpoint_every = 30;  // seconds; when it falls changes nothing but what a kill costs
+    Console::Clock::time_point saved = Console::Clock::now();
+};
+
+template <class Environment>
+void checkpoint_if_due(Run& run, Session<Environment>& session) {
+    const auto now = Console::Clock::now();
+    if (!stop_requested && Console::seconds_between(session.saved, now) < session.checkpoint_every) return;
+    save_checkpoint(run, session.folder);
+    session.saved = now;
+    if (stop_requested) {
+        if (session.console.terminal) std::fprintf(stderr, "\n");
+        fail("run.stopped", "stopped after update %llu; everything is saved in %s, and the same command continues",
+             static_cast<unsigned long long>(run.progress.updates), session.folder.path.c_str());
+    }
+}
+
+template <class Environment>
+void update_and_watch(Run& run, Session<Environment>& session) {
+    try {
+        update(run);
+    } catch (const Error& error) {
+        fail(error.id.c_str(), "update %llu of %s: %s; the run stops here, its last checkpoint is kept",
+             static_cast<unsigned long long>(run.progress.updates + 1), session.folder.path.c_str(), error.what());
+    }
+    checkpoint_if_due(run, session);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The two phases.
+
+// Evaluates the policy and adds a row to progress.csv: the state of things, and means since the row before.
+template <class Environment>
+void evaluate_and_record(Run& run, Session<Environment>& session) {
+    Progress& p = run.progress;
+    const Evaluation evaluation = evaluate(run, session.environment, p.evaluations, static_cast<int>(run.agent.settings.eval_episodes));
+    p.eval_length = evaluation.mean_length;
+    p.eval_return = evaluation.mean_return;
+    const double learning_rate = run.agent.settings.learning_rate *
+                                 warmup_factor(std::max<uint64_t>(1, p.updates) - 1, static_cast<uint64_t>(run.agent.settings.warmup_updates));
+    const auto mean = [](double sum, double count) { return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan"); };
+    const std::string line = csv_line(
+        {p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions), std::to_string(p.episodes),
+         number_text(learning_rate), mean(p.loss, p.summed_updates), mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
+         number_text(run.constrains_entropy() ? static_cast<double>(run.temperature.lambda()) : 0.0), mean(p.gradient_norm, p.summed_updates),
+         mean(p.short_pairs, p.pairs), mean(p.unmatched_pairs, p.pairs), std::to_string(run.memory.size()), number_text(p.eval_length),
+         number_text(p.eval_return), number_text(p.eval_return), mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
+    AppendFile(session.folder.file("progress.csv")).append(line);
+    p.progress_bytes += line.size();
+    p.evaluations += 1;
+    p.next_evaluation = p.episodes + static_cast<uint64_t>(run.agent.settings.eval_every);
+    p.loss = p.entropy = p.gradient_norm = p.summed_updates = p.pairs = p.short_pairs = p.unmatched_pairs = 0;
+    p.rollout_length = p.rollout_return = p.rollouts = 0;
+}
+
+// WODTEM sec. IV-B.3, Fig. 2: offline training on D_offline. The table has taken in every trajectory of it before.
+template <class Environment>
+void offline_phase(Run& run, Session<Environment>& session) {
+    const uint64_t updates = static_cast<uint64_t>(run.agent.settings.offline_updates);
+    while (run.progress.updates < updates) {
+        update_and_watch(run, session);
+        session.console.show(run, "offline", static_cast<double>(run.progress.updates) / static_cast<double>(updates));
+    }
+    evaluate_and_record(run, session);
+}
+
+// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout); it enters
+// D_online first in, first out, and the table at once, before the updates that follow it.
+template <class Environment>
+void interact(Run& run, Session<Environment>& session) {
+    Progress& p = run.progress;
+    std::vector<Trajectory> episodes = rollout(run, session.environment, Act::sample, run.agent.settings.g_online, p.episodes, 1);
+    Trajectory& episode = episodes[0];
+    p.episodes += 1;
+    p.interactions += static_cast<uint64_t>(episode.length());
+    p.rollouts += 1;
+    p.rollout_length += episode.length();
+    p.rollout_return += total_return(episode);
+    std::string moves;
+    for (size_t t = 0; run.agent.spec.moves > 0 && t < episode.actions.size(); ++t) moves += static_cast<char>('0' + static_cast<int>(episode.actions[t]));
+    const std::string line = csv_line({std::to_string(p.episodes), std::to_string(p.interactions), std::to_string(episode.length()),
+                                       number_text(total_return(episode)), episode.terminated ? "1" : "0", moves});
+    AppendFile(session.folder.file("episodes.csv")).append(line);
+    p.episodes_bytes += line.size();
+    remember(run, episode);
+    run.replay.add(std::move(episode));
+}
+
+// WODTEM sec. IV-B.3, Fig. 2: online fine-tuning on D_online, which begins as the best trajectories of D_offline.
+// Each iteration: one episode, then updates_per_iteration updates; every eval_every iterations an evaluation.
+template <class Environment>
+void online_phase(Run& run, Session<Environment>& session) {
+    const Settings& settings = run.agent.settings;
+    Progress& p = run.progress;
+    if (p.online == 0) {
+        run.replay.capacity = static_cast<size_t>(settings.buffer_size);
+        run.replay.start(std::move(run.replay.trajectories));
+        p.online = 1;
+    }
+    const uint64_t budget = static_cast<uint64_t>(settings.online_steps);
+    while (true) {
+        const uint64_t owed = static_cast<uint64_t>(settings.offline_updates) + p.episodes * static_cast<uint64_t>(settings.updates_per_iteration);
+        while (p.updates < owed) update_and_watch(run, session);
+        const bool last = p.interactions >= budget;
+        if (p.episodes >= p.next_evaluation || last) evaluate_and_record(run, session);
+        session.console.show(run, "online", std::min(1.0, static_cast<double>(p.interactions) / static_cast<double>(budget)));
+        if (last) return;
+        interact(run, session);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The grid world's side: environment and data set from settings, and the results that its figures need.
+
+// The place of a setting's word among an enumeration's names.
+template <size_t N>
+int choice(const std::array<const char*, N>& names, const std::string& name) {
+    return static_cast<int>(std::find(names.begin(), names.end(), name) - names.begin());
+}
+
+GridWorld make_environment(const Settings& settings) {
+    GridWorld world;
+    world.edge = static_cast<EdgeRule>(choice(edge_rule_names, settings.edge));
+    world.encoding = static_cast<StateEncoding>(choice(state_encoding_names, settings.state_encoding));
+    return world;
+}
+
+std::vector<Trajectory> make_data_set(const Settings& settings, const GridWorld& world) {
+    std::vector<Trajectory> trajectories = collect_data_set(world, static_cast<Behaviour>(choice(behaviour_names, settings.behaviour)),
+                                                            static_cast<uint32_t>(settings.data_seed), static_cast<int>(settings.data_trajectories));
+    const EnvironmentSpec spec = world.spec();
+    for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
+    return trajectories;
+}
+
+// The learned policy's distribution over moves in every cell, at the start of an evaluation: [36][8].
+std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
+    SequenceBatch batch;
+    for (world.cell = 0; world.cell < grid_cells; ++world.cell) {
+        std::vector<float> state(static_cast<size_t>(run.agent.spec.state_dim));
+        world.observe(state.data());
+        batch.lengths.push_back(1);
+        batch.timesteps.push_back(0);
+        batch.returns_to_go.push_back(static_cast<float>(run.agent.settings.g_eval * run.agent.settings.reward_scale));
+        append_normalised(batch.states, run.agent.normaliser, state.data());
+        batch.actions.resize(batch.actions.size() + grid_moves);
+    }
+    run.tape.reset();
+    run.tape.recording = false;
+    const Policy<float> policy = forward(run.tape, run.agent.model, batch, Ask::last_state);
+    std::vector<std::vector<float>> probabilities(grid_cells);
+    for (size_t i = 0; i < policy.mean.size(); ++i) probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
+    return probabilities;
+}
+
+// Shares of the moves made in the start cell.
+std::vector<double> moves_at_start(const std::vector<Trajectory>& trajectories, GridWorld world, int state_dim) {
+    std::vector<float> start(static_cast<size_t>(state_dim));
+    world.cell = grid_start;
+    world.observe(start.data());
+    std::vector<double> shares(grid_moves);
+    double visits = 0;
+    for (const Trajectory& trajectory : trajectories)
+        for (size_t t = 0; t < trajectory.actions.size(); ++t)
+            if (std::equal(start.begin(), start.end(), trajectory.states.begin() + static_cast<ptrdiff_t>(t * start.size())))
+                shares[static_cast<size_t>(trajectory.actions[t])] += 1, visits += 1;
+    for (double& share : shares) share /= std::max(1.0, visits);
+    return shares;
+}
+
+void save_grid_results(Run& run, const GridWorld& world, const RunFolder& folder) {
+    const std::vector<std::vector<float>> policy = policy_by_cell(run, world);
+    std::string cells = "row,column", start = "move,learned,offline,online\n";
+    for (const GridMove& move : grid_move_table) cells += std::string(",") + move.name;
+    cells += "\n";
+    for (int cell = 0; cell < grid_cells; ++cell) {
+        std::vector<std::string> fields = {std::to_string(cell / grid_size), std::to_string(cell % grid_size)};
+        for (const float p : policy[static_cast<size_t>(cell)]) fields.push_back(number_text(p));
+        cells += csv_line(fields);
+    }
+    const std::vector<double> offline = moves_at_start(make_data_set(run.agent.settings, world), world, run.agent.spec.state_dim);
+    const std::vector<double> online = moves_at_start(run.replay.trajectories, world, run.agent.spec.state_dim);
+    for (size_t move = 0; move < grid_moves; ++move)
+        start += csv_line({grid_move_table[move].name, number_text(policy[grid_start][move]), number_text(offline[move]),
+                           run.progress.online != 0 ? number_text(online[move]) : "nan"});
+    write_file_atomic(folder.file("policy.csv"), cells);
+    write_file_atomic(folder.file("start_actions.csv"), start);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// train
+
+// D_offline, its statistics, and the memory's first contents.
+void begin_run(Run& run, std::vector<Trajectory> data_set) {
+    run.agent.normaliser = fit_normaliser(data_set, run.agent.spec.state_dim);
+    run.replay.trajectories = offline_set(std::move(data_set), run.agent.settings.keep_lowest);
+    run.replay.capacity = run.replay.trajectories.size();
+    for (const Trajectory& trajectory : run.replay.trajectories) remember(run, trajectory);
+    run.replay.start(std::move(run.replay.trajectories));
+}
+
+// A folder may be new, hold this very run, or hold another: then nothing is touched.
+void claim_folder(const Settings& settings, const RunFolder& folder) {
+    std::error_code problem;
+    fs::create_directories(folder.path, problem);
+    if (problem) fail("run.folder", "cannot make the run folder %s: %s", folder.path.c_str(), problem.message().c_str());
+    const std::string path = folder.file("settings");
+    if (!fs::exists(path)) {
+        if (fs::exists(folder.file("progress.csv")) || fs::exists(folder.file("checkpoint.safetensors")))
+            fail("run.folder", "%s holds a run without its settings file; choose another folder with --out", folder.path.c_str());
+        write_file_atomic(path, settings_text(settings));
+        return;
+    }
+    const Settings found = settings_from_text(read_file(path, 1 << 20), path);
+    for (const SettingRow& row : setting_rows) {
+        const std::string was = setting_text(found, row), wanted = setting_text(settings, row);
+        if (was == wanted) continue;
+        const bool kernel = std::string(row.name) == "arithmetic";
+        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", folder.path.c_str(), row.name, was.c_str(), wanted.c_str(),
+             kernel ? "choose the kernel it was begun with (--kernel)" : "choose another folder with --out, or the same settings");
+    }
+}
+
+struct TrainOptions {
+    std::string kernel = "auto";
+    int threads = 1;
+    double checkpoint_every = 30;
+};
+
+void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
+    Session<GridWorld> session{make_environment(settings), {path}, {}, options.checkpoint_every};
+    session.console.label = settings.task + " " + settings.method + " seed " + std::to_string(settings.seed);
+    claim_folder(settings, session.folder);
+    if (fs::exists(session.folder.file("finished"))) {
+        std::printf("%s is finished already\n", path.c_str());
+        return;
+    }
+    Compute compute(choose_kernel(options.kernel), options.threads);
+    Run run(compute, settings, session.environment.spec());
+    if (fs::exists(session.folder.file("checkpoint.safetensors"))) {
+        load_checkpoint(run, session.folder);
+        std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(), static_cast<unsigned long long>(run.progress.updates));
+    } else {
+        begin_run(run, make_data_set(settings, session.environment));
+        write_file_atomic(session.folder.file("progress.csv"), progress_header);
+        write_file_atomic(session.folder.file("episodes.csv"), episodes_header);
+        run.progress.progress_bytes = std::string(progress_header).size();
+        run.progress.episodes_bytes = std::string(episodes_header).size();
+    }
+    session.console.first_update = run.progress.updates;
+    if (run.progress.online == 0) offline_phase(run, session);
+    if (settings.online_steps > 0) online_phase(run, session);
+    save_model(run, session.folder.file("model.safetensors"));
+    save_grid_results(run, session.environment, session.folder);
+    write_file_atomic(session.folder.file("finished"), "");
+    fs::remove(session.folder.file("checkpoint.safetensors"));
+    std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s\n", path.c_str(),
+                static_cast<unsigned long long>(run.progress.updates), static_cast<unsigned long long>(run.progress.interactions),
+                number_text(run.progress.eval_length).c_str(), number_text(run.progress.eval_return).c_str());
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The command line. `wodtem COMMAND ...`; results go to stdout, progress and errors to stderr.
+
+struct Option {
+    const char* name;
+    const char* value;  // what follows it, or null for a switch
+    const char* fallback;
+    const char* meaning;
+};
+
+struct Arguments {
+    std::vector<std::string> words;  // that are not options
+    std::map<std::string, std::string> options;
+    std::vector<std::string> assignments;  // --set name=value, any number
+    const std::string& operator[](const char* name) const { return options.at(name); }
+};
+
+struct Command {
+    const char* name;
+    const char* words;  // how the arguments look in the help
+    size_t least_words, most_words;
+    const char* meaning;
+    std::vector<Option> options;
+    void (*run)(const Arguments&);
+};
+
+const Option method_option = {"--method", "NAME", "wodtem", "dt, odt or wodtem"};
+const Option preset_option = {"--preset", "NAME", "small", "paper: Table I as printed; small: a narrower network"};
+const Option seed_option = {"--seed", "N", "0", "seed of everything but the data set"};
+const Option seeds_option = {"--seeds", "A-B", "", "several seeds, one after the other"};
+const Option set_option = {"--set", "NAME=VALUE", "", "any setting (see `wodtem info` of a run's model); may be repeated"};
+const Option kernel_option = {"--kernel", "NAME", "auto", "matrix kernel: avx512, avx2, portable, or the best there is"};
+const Option threads_option = {"--threads", "N", "0", "worker threads; 0: one per core; results do not depend on it"};
+
+// Errors: usage.number.
+int64_t whole_number(const std::string& text, const char* name, int64_t low, int64_t high) {
+    const std::optional<double> x = to_number(text);
+    if (!x || *x != std::floor(*x) || *x < static_cast<double>(low) || *x > static_cast<double>(high)) {
+        const double nearest = std::clamp(x.value_or(static_cast<double>(low)), static_cast<double>(low), static_cast<double>(high));
+        fail("usage.number", "%s cannot be \"%s\"; it is a whole number from %lld to %lld; the nearest is %.0f", name, text.c_str(),
+             static_cast<long long>(low), static_cast<long long>(high), std::round(nearest));
+    }
+    return static_cast<int64_t>(*x);
+}
+
+// "3", "0-4" or "1,3,8".
+std::vector<int64_t> seed_list(const std::string& text) {
+    std::vector<int64_t> seeds;
+    for (const std::string& part : split(text, ',')) {
+        const size_t dash = part.find('-', 1);
+        const int64_t first = whole_number(part.substr(0, dash), "a seed", 0, 4294967295);
+        const int64_t last = dash == std::string::npos ? first : whole_number(part.substr(dash + 1), "a seed", 0, 4294967295);
+        if (last < first || last - first > 9999) fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", part.c_str());
+        for (int64_t seed = first; seed <= last; ++seed) seeds.push_back(seed);
+    }
+    return seeds;
+}
+
+int thread_count(const Arguments& arguments) {
+    const int64_t asked = whole_number(arguments["--threads"], "--threads", 0, 256);
+    return asked > 0 ? static_cast<int>(asked) : static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
+}
+
+Settings asked_settings(const Arguments& arguments, int64_t seed) {
+    Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
+    settings.seed = seed;
+    settings.arithmetic = choose_kernel(arguments["--kernel"]).fused ? "fused" : "plain";
+    std::set<std::string> seen;
+    for (const std::string& assignment : arguments.assignments) {
+        const size_t equals = assignment.find('=');
+        if (equals == std::string::npos) fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
+        const std::string name = assignment.substr(0, equals);
+        const std::string row = setting_row(name).name;
+        for (const char* fixed : {"task", "method", "preset", "seed", "arithmetic"})
+            if (row == fixed) fail("usage.setting", "%s is not given by --set; use its own argument (see wodtem train --help)", fixed);
+        if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
+        set_from(settings, name, assignment.substr(equals + 1), "command line");
+    }
+    check_together(settings);
+    return settings;
+}
+
+std::string default_folder(const Settings& settings) {
+    return "runs/" + settings.task + "-" + settings.preset + "-" + settings.method + "-" + std::to_string(settings.seed);
+}
+
+void command_train(const Arguments& arguments) {
+    TrainOptions options;
+    options.kernel = arguments["--kernel"];
+    options.threads = thread_count(arguments);
+    options.checkpoint_every = static_cast<double>(whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400));
+    const bool several = !arguments["--seeds"].empty();
+    for (const int64_t seed : seed_list(several ? arguments["--seeds"] : arguments["--seed"])) {
+        const Settings settings = asked_settings(arguments, seed);
+        std::string folder = arguments["--out"].empty() ? default_folder(settings) : arguments["--out"];
+        if (several && !arguments["--out"].empty()) folder += "/seed-" + std::to_string(seed);
+        std::string line;
+        for (const SettingRow& row : setting_rows) line += std::string(" ") + row.name + "=" + setting_text(settings, row);
+        std::fprintf(stderr, "%s:%s\n", folder.c_str(), line.c_str());
+        train(settings, folder, options);
+    }
+}
+
+struct LoadedModel {
+    Settings settings;
+    GridWorld environment;
+    std::unique_ptr<Compute> compute;
+    std::unique_ptr<Run> run;
+};
+
+LoadedModel open_model(const std::string& path, const Arguments& arguments) {
+    const TensorFile file = read_safetensors(path);
+    const auto format = file.metadata.find("format");
+    if (format == file.metadata.end() || format->second != "wodtem model 1")
+        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
+    LoadedModel model;
+    model.settings = settings_from_text(file.text("settings"), path);
+    model.environment = make_environment(model.settings);
+    model.compute = std::make_unique<Compute>(choose_kernel(arguments["--kernel"]), thread_count(arguments));
+    model.run = std::make_unique<Run>(*model.compute, model.settings, model.environment.spec());
+    load_model(*model.run, file);
+    return model;
+}
+
+void command_eval(const Arguments& arguments) {
+    LoadedModel model = open_model(arguments.words[0], arguments);
+    const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 1000000));
+    const Evaluation evaluation = evaluate(*model.run, model.environment, 0, count);
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s over %d episode%s\n", model.settings.task.c_str(), model.settings.method.c_str(),
+                static_cast<long long>(model.settings.seed), number_text(evaluation.mean_length).c_str(), number_text(evaluation.mean_return).c_str(),
+                count, count == 1 ? "" : "s");
+    std::printf("first episode:");
+    for (const float move : evaluation.episodes[0].actions) std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
+    std::printf("\n");
+}
+
+void command_report(const Arguments& arguments) {
+    const std::string out = arguments["--out"];
+    std::printf("%s", report(arguments.words, out).c_str());
+    std::printf("report: %s/report.html\n", out.c_str());
+}
+
+void command_sweep(const Arguments& arguments) {
+    const std::vector<std::string> methods = split(arguments["--methods"], ',');
+    for (const std::string& method : methods)
+        for (const int64_t seed : seed_list(arguments["--seeds"])) {
+            const Settings settings = default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0], method, arguments["--preset"]);
+            std::printf("./wodtem train %s --method %s --preset %s --seed %lld\n", settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
+                        static_cast<long long>(seed));
+        }
+}
+
+template <class T>
+std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
+    const std::vector<T> values = file.get<T>(tensor.name, tensor.shape);
+    if (values.empty()) return "empty";
+    double low = INFINITY, high = -INFINITY, sum = 0;
+    size_t bad = 0;
+    for (const T value : values) {
+        const double x = static_cast<double>(value);
+        if (!std::isfinite(x)) {
+            ++bad;
+            continue;
+        }
+        low = std::min(low, x), high = std::max(high, x), sum += x;
+    }
+    char text[160];
+    std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g%s", low, high, sum / static_cast<double>(values.size() - bad),
+                  bad > 0 ? ", NOT FINITE: " : "");
+    return text + (bad > 0 ? std::to_string(bad) : std::string());
+}
+
+void command_info(const Arguments& arguments) {
+    const std::string& path = arguments.words[0];
+    const std::string bytes = read_file(path);
+    std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), bytes.size(), hex8(crc32(bytes)).c_str());
+    const TensorFile file = parse_safetensors(bytes, path);
+    for (const auto& [key, text] : file.metadata)
+        std::printf("%s%s%s%s", key.c_str(), text.find('\n') == std::string::npos ? ": " : ":\n", text.c_str(), text.ends_with('\n') ? "" : "\n");
+    for (const StoredTensor& tensor : file.tensors) {
+        std::string range;
+        if (tensor.dtype == DType::F32) range = value_range<float>(file, tensor);
+        if (tensor.dtype == DType::F64) range = value_range<double>(file, tensor);
+        if (tensor.dtype == DType::U8) range = value_range<uint8_t>(file, tensor);
+        if (tensor.dtype == DType::U32) range = value_range<uint32_t>(file, tensor);
+        if (tensor.dtype == DType::U64) range = value_range<uint64_t>(file, tensor);
+        if (tensor.dtype == DType::I64) range = value_range<int64_t>(file, tensor);
+        std::printf("%-44s %s %-14s %s\n", tensor.name.c_str(), about(tensor.dtype).name, shape_text(tensor.shape).c_str(), range.c_str());
+    }
+}
+
+void command_tasks(const Arguments&) {
+    std::printf("%-12s %-10s %-8s %-8s %s\n", "task", "state", "actions", "steps", "data set");
+    const EnvironmentSpec spec = GridWorld{}.spec();
+    std::printf("%-12s %-10d %-8d %-8d %d trajectories of a fixed policy, made on the spot (behaviour: right_down, or left_down)\n", "gridworld",
+                spec.state_dim, spec.moves, spec.max_episode_steps, 500);
+}
+
+// ---- bench
+
+double seconds_of(const std::function<void()>& work) {
+    const auto begin = Console::Clock::now();
+    work();
+    return Console::seconds_between(begin, Console::Clock::now());
+}
+
+struct Spread {
+    double low, median, high;
+};
+
+// Of `rounds` runs, after one that does not count.
+Spread timed(int rounds, const std::function<void()>& work) {
+    work();
+    std::vector<double> seconds;
+    for (int round = 0; round < rounds; ++round) seconds.push_back(seconds_of(work));
+    std::sort(seconds.begin(), seconds.end());
+    return {seconds.front(), seconds[seconds.size() / 2], seconds.back()};
+}
+
+// The shapes of the paper's grid-world network at batch 256, and of a gym network's layer on 1024 tokens.
+void bench_products(const Kernel& kernel) {
+    Compute compute(kernel, 1);
+    volatile float sink = 0;
+    const double burn = 2e9 / burn_flops(kernel);
+    const Spread peak = timed(7, [&] { sink = sink + kernel.burn(static_cast<int64_t>(burn)); });
+    const double peak_rate = 2e9 / peak.low / 1e9;
+    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only; median %.1f)\n", kernel.name, peak_rate, 2e9 / peak.median / 1e9);
+    struct Case {
+        const char* what;
+        int M, N, K;
+        bool a_transposed, b_transposed;
+    };
+    for (const Case& s : {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
+                           Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
+                           Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
+                           Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
+        const auto size = [](int rows, int columns) { return static_cast<size_t>(rows) * static_cast<size_t>(columns); };
+        const std::vector<float> a(size(s.M, s.K), 0.5f), b(size(s.K, s.N), 0.25f);
+        std::vector<float> c(size(s.M, s.N));
+        const double flops = 2.0 * s.M * s.N * s.K;
+        const int repeats = std::max(1, static_cast<int>(5e8 / flops));
+        const Spread time = timed(7, [&] {
+            for (int i = 0; i < repeats; ++i)
+                matmul(compute, View<float>{c.data(), s.N}, {a.data(), s.a_transposed ? s.M : s.K, s.a_transposed},
+                       {b.data(), s.b_transposed ? s.K : s.N, s.b_transposed}, s.M, s.N, s.K, Store::overwrite);
+        });
+        const double rate = flops * repeats / time.median / 1e9;
+        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N, s.K, rate, 100 * rate / peak_rate,
+                    100 * flops * repeats / time.high / 1e9 / peak_rate, 100 * flops * repeats / time.low / 1e9 / peak_rate);
+    }
+}
+
+// Arithmetic of one update that the action prediction needs, K = 1 and one layer: forward 14 d^2 products a window, and
+// twice that backward.
+void bench_update(const Kernel& kernel, int threads, const char* preset) {
+    Compute compute(kernel, threads);
+    const Settings settings = default_settings("gridworld", "wodtem", preset);
+    const GridWorld world;
+    Run run(compute, settings, world.spec());
+    begin_run(run, make_data_set(settings, world));
+    const int repeats = std::string(preset) == "small" ? 200 : 1;
+    const Spread time = timed(7, [&] {
+        for (int i = 0; i < repeats; ++i) update(run);
+    });
+    const double flops = 84.0 * static_cast<double>(settings.width * settings.width * settings.batch_size) * repeats;
+    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n", preset,
+                static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s", time.median / repeats * 1e3, time.low / repeats * 1e3,
+                time.high / repeats * 1e3, flops / time.median / 1e9);
+}
+
+// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
+void bench_memory(size_t entries) {
+    MemoryConfig config{};
+    config.state_dim = config.projected_dim = 4;
+    config.action_dim = 8;
+    config.capacity = entries;
+    config.K = 2;
+    config.epsilon = 0.1;
+    EpisodicMemory memory(config, 0);
+    const Random random{1, Stream::data_set};
+    const auto state_of = [&](size_t i) {
+        std::array<float, 4> state;
+        for (uint32_t j = 0; j < 4; ++j) state[j] = static_cast<float>(10 * random.uniform(i, j));
+        return state;
+    };
+    const std::array<float, 8> action{};
+    EpisodicMemory::Changes changes;
+    const double insertion = seconds_of([&] {
+        for (size_t i = 0; i < entries; ++i) memory.update_one(changes, state_of(i).data(), action.data(), 1.0);
+    });
+    const double build = seconds_of([&] { memory.rebuild_index(); });
+    constexpr size_t queries = 20000;
+    size_t at = 0;
+    const Spread time = timed(7, [&] {
+        for (size_t i = 0; i < queries; ++i) {
+            std::array<float, 4> state = state_of((at += 7919) % entries);
+            state[0] += 0.01f;
+            memory.neighbours(state.data());
+        }
+    });
+    std::printf("  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
+                entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6, insertion / static_cast<double>(entries) * 1e6,
+                build, static_cast<double>(memory.bytes()) / static_cast<double>(entries));
+}
+
+void command_bench(const Arguments& arguments) {
+    const Kernel& chosen = choose_kernel(arguments["--kernel"]);
+    const int threads = thread_count(arguments);
+    std::printf("medians of 7 runs, and their range\n");
+    for (const Kernel* kernel : kernels)
+        if (kernel->supported() && (arguments["--kernel"] == "auto" || kernel == &chosen)) bench_products(*kernel);
+    std::printf("%s:\n", chosen.name);
+    for (const char* preset : {"small", "paper"})
+        for (int count = 1; count <= threads; count *= 2) bench_update(chosen, count, preset);
+    for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(entries);
+}
+
+const std::vector<Command>& commands() {
+    static const std::vector<Command> list = {
+        {"train", "TASK", 1, 1, "offline phase, online phase, evaluations; continues what is there",
+         {method_option, preset_option, seed_option, seeds_option, set_option, {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
+          kernel_option, threads_option, {"--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"}},
+         command_train},
+        {"eval", "MODEL", 1, 1, "evaluate a saved model; needs nothing else", {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option}, command_eval},
+        {"report", "DIR...", 1, 10000, "tables and figures of runs: one HTML file, SVG files, Markdown", {{"--out", "DIR", "runs/report", "where to write"}}, command_report},
+        {"sweep", "[TASK]", 0, 1, "print one train command per method and seed, for any job runner",
+         {{"--methods", "LIST", "dt,odt,wodtem", "methods, separated by commas"}, {"--seeds", "A-B", "0-4", "seeds"}, preset_option}, command_sweep},
+        {"info", "FILE", 1, 1, "what is in a model or checkpoint: names, shapes, ranges, checksum", {}, command_info},
+        {"bench", "", 0, 0, "the machine's peak, each kernel's share of it, update and look-up times", {kernel_option, threads_option}, command_bench},
+        {"tasks", "", 0, 0, "list tasks and data sets", {}, command_tasks},
+    };
+    return list;
+}
+
+void print_help(const Command* command) {
+    if (!command) {
+        std::printf("wodtem: decision transformers that go from offline data to online interaction, with an episodic memory\n\n");
+        for (const Command& c : commands()) std::printf("  wodtem %-7s%-9s %s\n", c.name, c.words, c.meaning);
+        std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
+        return;
+    }
+    std::printf("wodtem %s %s\n%s\n\n", command->name, command->words, command->meaning);
+    for (const Option& option : command->options) {
+        const std::string left = std::string(option.name) + " " + (option.value ? option.value : "");
+        std::printf("  %-26s %s%s%s\n", left.c_str(), option.meaning, *option.fallback ? "; default " : "", option.fallback);
+    }
+    if (std::string(command->name) == "train") {
+        std::printf("\nSettings for --set, with the values of preset paper:\n");
+        const Settings settings;
+        for (const SettingRow& row : setting_rows) std::printf("  %-24s %-12s %s\n", row.name, setting_text(settings, row).c_str(), row.source);
+    }
+}
+
+Arguments parse_arguments(const Command& command, const std::vector<std::string>& words) {
+    Arguments arguments;
+    std::set<std::string> seen;
+    std::vector<std::string> names;
+    for (const Option& option : command.options) arguments.options[option.name] = option.fallback, names.push_back(option.name);
+    for (size_t i = 0; i < words.size(); ++i) {
+        if (!words[i].starts_with("--")) {
+            arguments.words.push_back(words[i]);
+            continue;
+        }
+        const auto option = std::find_if(command.options.begin(), command.options.end(), [&](const Option& o) { return words[i] == o.name; });
+        if (option == command.options.end()) {
+            if (names.empty()) fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
+            fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, words[i].c_str(), nearest_name(words[i], names).c_str());
+        }
+        if (i + 1 == words.size()) fail("usage.option", "option %s needs a value: %s", option->name, option->value);
+        const std::string& value = words[++i];
+        if (std::string(option->name) == "--set") {
+            arguments.assignments.push_back(value);
+            continue;
+        }
+        if (!seen.insert(option->name).second) fail("usage.option", "option %s is given twice", option->name);
+        arguments.options[option->name] = value;
+    }
+    if (arguments.words.size() < command.least_words || arguments.words.size() > command.most_words)
+        fail("usage.words", "wodtem %s takes %s; %zu argument%s given (wodtem %s --help)", command.name, *command.words ? command.words : "no argument",
+             arguments.words.size(), arguments.words.size() == 1 ? " was" : "s were", command.name);
+    return arguments;
+}
+
+int run_command_line(const std::vector<std::string>& words) {
+    if (words.empty() || words[0] == "--help" || words[0] == "help") {
+        print_help(nullptr);
+        return words.empty() ? 2 : 0;
+    }
+    std::vector<std::string> names;
+    for (const Command& command : commands()) {
+        names.push_back(command.name);
+        if (words[0] != command.name) continue;
+        const std::vector<std::string> rest(words.begin() + 1, words.end());
+        if (std::find(rest.begin(), rest.end(), "--help") != rest.end())
+            print_help(&command);
+        else
+            command.run(parse_arguments(command, rest));
+        if (std::fflush(stdout) != 0 || std::ferror(stdout)) fail("console.write", "cannot write the results to stdout: is the disk full?");
+        return 0;
+    }
+    fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(), nearest_name(words[0], names).c_str());
+}
+
+#ifndef WODTEM_NO_MAIN
+int main(int argument_count, char** arguments) {
+    for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int) { stop_requested = 1; });
+    std::signal(SIGPIPE, SIG_IGN);  // a closed pipe is an error of write, told in a sentence
+    std::signal(SIGXFSZ, SIG_IGN);  // and so is a file size limit
+    try {
+        return run_command_line({arguments + 1, arguments + argument_count});
+    } catch (const Error& error) {
+        std::fprintf(stderr, "wodtem: %s\n", error.what());
+        return error.id.starts_with("usage.") ? 2 : 1;
+    } catch (const std::bad_alloc&) {
+        std::fprintf(stderr, "wodtem: out of memory\n");
+    } catch (const std::exception& error) {
+        std::fprintf(stderr, "wodtem: %s\n", error.what());
+    }
+    return 1;
+}
+#endif
