@@ -13,7 +13,7 @@
 CXX = g++
 # -O3: loops in vectors. -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
-CXXFLAGS = -std=c++20 -O3 -g -pthread -ffp-contract=off \
+CXXFLAGS = -std=c++20 -O3 -pthread -ffp-contract=off \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
 HEADERS = $(wildcard *.hpp data/*.hpp tests/*.hpp)
 TESTS = $(patsubst tests/%.cpp,%,$(wildcard tests/*.cpp))

@@ -662,9 +662,9 @@ struct EpisodicMemory {
         return &actions[found[k].entry * A];
     }
 
-    // Is a_c "the historical optimal action": d >= e-hat(s)? Tested as sum_k p_k (e_k - d) <= 0, which is exact where it
-    // matters: a rounded mean of equal numbers can exceed them, and give alpha for nothing. No neighbours: yes, nothing
-    // speaks against it.
+    // Is a_c "the historical optimal action": d >= e-hat(s)? Tested as sum_k p_k (e_k - d) <= 0, which is exact where
+    // it matters: a rounded mean of equal numbers can exceed them, and give alpha for nothing. No neighbours: yes,
+    // nothing speaks against it.
     bool is_optimal(const std::vector<Neighbour>& found, double d) const {
         double excess = 0.0;
         for (size_t k = 0; k < found.size(); ++k) excess += similarity(found, k) * (e[found[k].entry] - d);

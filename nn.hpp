@@ -146,9 +146,9 @@ class Threads {
         body_.store(const_cast<void*>(static_cast<const void*>(&f)), std::memory_order_relaxed);
         tasks_.store(static_cast<uint32_t>(tasks), std::memory_order_relaxed);
         unfinished_.store(tasks, std::memory_order_relaxed);
-        // Ticket = (generation, next task). The release makes the job above visible to whoever sees the generation.
+        // Ticket = (generation, tasks not yet taken). The release makes the job above visible to whoever sees it.
         const uint64_t generation = (ticket_.load(std::memory_order_relaxed) >> 32) + 1;
-        ticket_.store(generation << 32, std::memory_order_release);
+        ticket_.store(generation << 32 | static_cast<uint32_t>(tasks), std::memory_order_release);
         ticket_.notify_all();
         take_tasks(0);
         for (int spins = 0; unfinished_.load(std::memory_order_acquire) != 0; ++spins) pause(spins);
@@ -164,17 +164,17 @@ class Threads {
 #endif
     }
 
-    // Takes tasks until none is left. A late worker may read the next job's fields beside an old ticket; then the
-    // ticket has moved on, the exchange fails, and nothing was taken. Once a task is taken, run() cannot return, so
-    // the job stays.
+    // Takes tasks until none is left. That none is left stands in the ticket itself, so an old ticket never leads into
+    // the next job: while it names tasks, its job's fields stay, because run() waits for them; a worker that reads
+    // later fields beside it finds that the ticket has moved on, the exchange fails, and nothing was taken.
     uint64_t take_tasks(int worker) {
         uint64_t ticket = ticket_.load(std::memory_order_acquire);
         while (true) {
             const Call call = call_.load(std::memory_order_relaxed);
             void* body = body_.load(std::memory_order_relaxed);
-            const uint32_t task = static_cast<uint32_t>(ticket);
-            if (task >= tasks_.load(std::memory_order_relaxed)) return ticket;
-            if (!ticket_.compare_exchange_weak(ticket, ticket + 1, std::memory_order_acq_rel)) continue;
+            const uint32_t left = static_cast<uint32_t>(ticket), task = tasks_.load(std::memory_order_relaxed) - left;
+            if (left == 0) return ticket;
+            if (!ticket_.compare_exchange_weak(ticket, ticket - 1, std::memory_order_acq_rel)) continue;
             call(body, static_cast<int>(task), worker);
             unfinished_.fetch_sub(1, std::memory_order_release);
             ticket = ticket_.load(std::memory_order_acquire);
@@ -185,9 +185,9 @@ class Threads {
     void work(int worker) {
         while (true) {
             const uint64_t seen = take_tasks(worker);
+            if (stop_.load(std::memory_order_relaxed)) return;  // `seen` may be the last ticket: none follows it
             for (int spins = 0; spins < 1000 && ticket_.load(std::memory_order_relaxed) == seen; ++spins) pause(spins);
             ticket_.wait(seen, std::memory_order_acquire);
-            if (stop_.load(std::memory_order_relaxed)) return;
         }
     }
 
@@ -360,7 +360,7 @@ inline const Kernel* const kernels[] = {&kernel_portable};
 
 inline double burn_flops(const Kernel& kernel) { return 2.0 * burn_chains * kernel.tile_columns / 2; }
 
-// By name, or the best one that the machine has for "auto". Errors: kernel.unknown, kernel.unsupported.
+// By name, or the best one that the machine has for "auto". Errors: usage.kernel.
 inline const Kernel& choose_kernel(const std::string& name) {
     std::string available;
     for (const Kernel* kernel : kernels) {
@@ -499,7 +499,8 @@ T dot(const T* a, const T* b, int n) {
         sum += *reinterpret_cast<const Unaligned*>(a + i) * *reinterpret_cast<const Unaligned*>(b + i);
     const auto eight = __builtin_shufflevector(sum, sum, 0, 1, 2, 3, 4, 5, 6, 7) +
                        __builtin_shufflevector(sum, sum, 8, 9, 10, 11, 12, 13, 14, 15);
-    const auto four = __builtin_shufflevector(eight, eight, 0, 1, 2, 3) + __builtin_shufflevector(eight, eight, 4, 5, 6, 7);
+    const auto four =
+        __builtin_shufflevector(eight, eight, 0, 1, 2, 3) + __builtin_shufflevector(eight, eight, 4, 5, 6, 7);
     T rest = 0;
     for (; i < n; ++i) rest += a[i] * b[i];
     return ((four[0] + four[2]) + (four[1] + four[3])) + rest;
@@ -525,16 +526,25 @@ class Arena {
     void* take(size_t bytes) {
         bytes = (bytes + 63) / 64 * 64;
         while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) ++chunk_, used_ = 0;
-        if (chunk_ == chunks_.size()) {
-            const size_t size = std::max(bytes, size_t{1} << 20);
-            chunks_.push_back({std::unique_ptr<char[], Release>(new (std::align_val_t{64}) char[size]), size});
-        }
+        if (chunk_ == chunks_.size()) add_chunk(std::max(bytes, size_t{1} << 20));
         used_ += bytes;
         return chunks_[chunk_].data.get() + used_ - bytes;
     }
-    void reset() { chunk_ = used_ = 0; }
+    // Joins the chunks into one, or batches of ever new shapes would each leave theirs behind.
+    void reset() {
+        size_t total = 0;
+        for (const Chunk& chunk : chunks_) total += chunk.bytes;
+        chunk_ = used_ = 0;
+        if (chunks_.size() > 1) {
+            chunks_.clear();
+            add_chunk(total);
+        }
+    }
 
   private:
+    void add_chunk(size_t bytes) {
+        chunks_.push_back({std::unique_ptr<char[], Release>(new (std::align_val_t{64}) char[bytes]), bytes});
+    }
     struct Release {
         void operator()(char* data) const { operator delete[](data, std::align_val_t{64}); }
     };
@@ -800,7 +810,7 @@ void relu(Tape<T>& tape, Tensor<T> x) {
     Compute& compute = tape.compute;
     const ptrdiff_t d = x.columns;
     for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
-        for (ptrdiff_t i = begin * d; i < end * d; ++i) x.value[i] = x.value[i] > 0 ? x.value[i] : T(0);
+        for (ptrdiff_t i = begin * d; i < end * d; ++i) x.value[i] = x.value[i] < 0 ? T(0) : x.value[i];  // NaN stays
     });
     tape.on_backward([=, &compute] {
         for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
@@ -857,7 +867,7 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     const size_t row = static_cast<size_t>(longest);
     T* weights = tape.template scratch<T>(static_cast<size_t>(q.rows * heads) * row);  // [queries, heads, longest]
     Compute& compute = tape.compute;
-    const int work = 1 + 4 * longest * d * std::max(1, q.rows / std::max(1, span_count));
+    const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
     for_rows(compute, span_count, work, [=](int begin, int end) {
         for (int s = begin; s < end; ++s)
             for (int i = spans[s].first_query; i < spans[s].first_query + spans[s].queries; ++i)
@@ -1025,6 +1035,13 @@ struct Transformer {
                  "a transformer of width %d cannot have %d heads in %d layers: the width must be a multiple of the "
                  "heads, and there must be at least one of each",
                  d, c.heads, c.layers);
+        if (c.state_dim < 1 || c.action_dim < 1 || c.max_timesteps < 0 || !(c.dropout >= 0 && c.dropout < 1) ||
+            (c.head != Head::deterministic && c.action_dim > d))
+            fail(
+                "nn.config",
+                "a transformer cannot have %d state and %d action dimensions, %d positions and dropout %g: it needs at "
+                "least one of each dimension, no more action dimensions than its width, %d, and dropout in [0, 1)",
+                c.state_dim, c.action_dim, c.max_timesteps, static_cast<double>(c.dropout), d);
         embed_return = linear_layer("embed_return", 1, d, Init::uniform_fan_in, seed);
         embed_state = linear_layer("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
         embed_action = linear_layer("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);

@@ -3,9 +3,9 @@
 // In order: settings (Tables I and II, each value with its source); the agent and all training state; batches and the
 // memory's advice, eqs. (4) to (7); the objective and its two steps, eqs. (1) to (3) and (8) to (10); acting and
 // evaluation, sec. III-B; the offline and the online phase, sec. IV-B.3; the run folder; commands; main.
-// One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and the
-// online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
-// Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
+// One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and
+// the online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit. Promises: a run is a function of
+// its settings: the same bytes for any number of threads, in one go or continued.
 
 #include <unistd.h>
 
@@ -78,7 +78,7 @@ inline const SettingRow setting_rows[] = {
     // The network. WODTEM Table I (rows 1 to 3, 9); the rest as in ODT's code.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
-    {"width", &Settings::width, 1, 65536, "", "WODTEM Table I: embedding dimension"},
+    {"width", &Settings::width, 8, 65536, "", "WODTEM Table I: embedding dimension"},
     {"context_length", &Settings::context_length, 1, 1000, "", "WODTEM Table I: context length C"},
     {"eval_context", &Settings::eval_context, 1, 1000, "", "ODT's code: 5, here no longer than context_length"},
     {"position", &Settings::position, 0, 0, "", "WODTEM Table I: position"},
@@ -97,7 +97,8 @@ inline const SettingRow setting_rows[] = {
     // Optimisation of lambda.
     {"initial_lambda", &Settings::initial_lambda, 1e-9, 1e3, "", "ODT's code"},
     {"lambda_learning_rate", &Settings::lambda_learning_rate, 0, 1, "", "ODT's code: Adam on log lambda"},
-    {"eta", &Settings::eta, -many, many, "", "chosen: minus the number of action dimensions, as ODT's; paper: a constant"},
+    {"eta", &Settings::eta, -many, many, "",
+     "chosen: minus the number of action dimensions, as ODT's; paper: a constant"},
     // Data and interaction.
     {"online_steps", &Settings::online_steps, 0, many, "", "WODTEM sec. V-D: 20K; 0: offline only"},
     {"buffer_size", &Settings::buffer_size, 1, 1e6, "", "WODTEM Table I: buffer size, trajectories"},
@@ -117,13 +118,16 @@ inline const SettingRow setting_rows[] = {
     {"table_size", &Settings::table_size, 1, 1e8, "", "WODTEM sec. V-D: entries"},
     {"keys", &Settings::keys, 0, 0, "raw|normalized", "chosen: WODTEM sec. IV-B.1 indexes by states"},
     {"eviction", &Settings::eviction, 0, 0, "lfu|lru", "WODTEM sec. IV-B.1: least frequently accessed"},
-    {"exclude_self", &Settings::exclude_self, 0, 0, "", "WODTEM sec. IV-B.2: no exception is made for the state itself"},
+    {"exclude_self", &Settings::exclude_self, 0, 0, "",
+     "WODTEM sec. IV-B.2: no exception is made for the state itself"},
     // The grid world.
-    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down", "chosen: the paper's statistics rule out its words"},
+    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down",
+     "chosen: the paper's statistics rule out its words"},
     {"edge", &Settings::edge, 0, 0, "clipped|stays|wraps|excluded", "chosen: fits the paper's statistics"},
     {"state_encoding", &Settings::state_encoding, 0, 0, "coordinates|one_hot", "chosen: (row, column)"},
     {"data_trajectories", &Settings::data_trajectories, 1, 1e6, "", "WODTEM sec. IV-A"},
-    {"data_seed", &Settings::data_seed, 0, 4294967295, "", "chosen: gives mean length 47.50 and return 0.91, sec. IV-A"},
+    {"data_seed", &Settings::data_seed, 0, 4294967295, "",
+     "chosen: gives mean length 47.50 and return 0.91, sec. IV-A"},
 };
 
 // The number of single-letter changes from one word to the other (Levenshtein), for "did you mean".
@@ -174,7 +178,8 @@ const SettingRow& setting_row(const std::string& name) {
         if (name == row.name) return row;
         names.push_back(row.name);
     }
-    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(), nearest_name(name, names).c_str());
+    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(),
+         nearest_name(name, names).c_str());
 }
 
 std::string setting_text(const Settings& settings, const SettingRow& row) {
@@ -196,24 +201,25 @@ void set_setting(Settings& settings, const std::string& name, const std::string&
     if (auto field = std::get_if<std::string Settings::*>(&row.field)) {
         const std::vector<std::string> choices = split(row.choices, '|');
         if (std::find(choices.begin(), choices.end(), text) == choices.end())
-            fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(), row.choices,
-                 nearest_name(text, choices).c_str());
-        settings.**field = text;
+            fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
+                 row.choices, nearest_name(text, choices).c_str());
+        settings.** field = text;
     } else if (auto flag = std::get_if<bool Settings::*>(&row.field)) {
-        if (text != "yes" && text != "no") fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
-        settings.**flag = text == "yes";
+        if (text != "yes" && text != "no")
+            fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
+        settings.** flag = text == "yes";
     } else {
         const std::optional<double> x = to_number(text);
         const auto whole = std::get_if<int64_t Settings::*>(&row.field);
         const bool in_range = x && *x >= row.low && *x <= row.high && (!whole || *x == std::floor(*x));
         if (!in_range) {
             const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
-            fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name, text.c_str(),
-                 whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
+            fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
+                 text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
                  number_text(whole ? std::round(nearest) : nearest).c_str());
         }
         if (whole)
-            settings.**whole = static_cast<int64_t>(*x);
+            settings.** whole = static_cast<int64_t>(*x);
         else
             settings.*std::get<double Settings::*>(row.field) = *x;
     }
@@ -240,13 +246,15 @@ Settings default_settings(const std::string& task, const std::string& method, co
 
 void check_together(const Settings& settings) {
     if (settings.width % settings.heads != 0)
-        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", static_cast<long long>(settings.width),
-             static_cast<long long>(settings.heads), static_cast<long long>((settings.width / settings.heads + 1) * settings.heads));
+        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld",
+             static_cast<long long>(settings.width), static_cast<long long>(settings.heads),
+             static_cast<long long>((settings.width / settings.heads + 1) * settings.heads));
     if (settings.eval_context > settings.context_length)
-        fail("usage.setting", "eval_context %lld is longer than the context_length %lld that is trained", static_cast<long long>(settings.eval_context),
-             static_cast<long long>(settings.context_length));
+        fail("usage.setting", "eval_context %lld is longer than the context_length %lld that is trained",
+             static_cast<long long>(settings.eval_context), static_cast<long long>(settings.context_length));
     if (settings.online_steps > 0 && settings.method == "dt")
-        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", static_cast<long long>(settings.online_steps));
+        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
+             static_cast<long long>(settings.online_steps));
 }
 
 // name = value    # source
@@ -281,7 +289,9 @@ Normaliser fit_normaliser(const std::vector<Trajectory>& trajectories, int state
         double count = 0, sum = 0, squares = 0;
         const auto each = [&](auto&& f) {
             for (const Trajectory& trajectory : trajectories)
-                for (size_t at = static_cast<size_t>(i); at < trajectory.states.size(); at += static_cast<size_t>(state_dim)) f(trajectory.states[at]);
+                for (size_t at = static_cast<size_t>(i); at < trajectory.states.size();
+                     at += static_cast<size_t>(state_dim))
+                    f(trajectory.states[at]);
         };
         each([&](float x) { sum += x, ++count; });
         const double mean = sum / count;
@@ -309,7 +319,9 @@ TransformerConfig transformer_config(const Settings& settings, const Environment
     config.width = static_cast<int>(settings.width);
     config.max_timesteps = settings.position ? 1000 : 0;  // ODT's code: a table of 1000 rows
     config.dropout = static_cast<float>(settings.dropout);
-    config.head = spec.moves > 0 ? Head::categorical : settings.method == "dt" ? Head::deterministic : Head::squashed_gaussian;
+    config.head = spec.moves > 0            ? Head::categorical
+                  : settings.method == "dt" ? Head::deterministic
+                                            : Head::squashed_gaussian;
     return config;
 }
 
@@ -358,17 +370,29 @@ struct Progress {
 
     template <class Archive>
     void visit(Archive& archive) {
-        for (auto [name, field] : std::initializer_list<std::pair<const char*, uint64_t&>>{
-                 {"progress.updates", updates}, {"progress.interactions", interactions}, {"progress.episodes", episodes},
-                 {"progress.online", online}, {"progress.evaluations", evaluations}, {"progress.next_evaluation", next_evaluation},
-                 {"progress.progress_bytes", progress_bytes}, {"progress.episodes_bytes", episodes_bytes}})
+        for (auto [name, field] :
+             std::initializer_list<std::pair<const char*, uint64_t&>>{{"progress.updates", updates},
+                                                                      {"progress.interactions", interactions},
+                                                                      {"progress.episodes", episodes},
+                                                                      {"progress.online", online},
+                                                                      {"progress.evaluations", evaluations},
+                                                                      {"progress.next_evaluation", next_evaluation},
+                                                                      {"progress.progress_bytes", progress_bytes},
+                                                                      {"progress.episodes_bytes", episodes_bytes}})
             archive(name, field);
-        for (auto [name, field] : std::initializer_list<std::pair<const char*, double&>>{
-                 {"progress.loss", loss}, {"progress.entropy", entropy}, {"progress.gradient_norm", gradient_norm},
-                 {"progress.summed_updates", summed_updates}, {"progress.pairs", pairs}, {"progress.short_pairs", short_pairs},
-                 {"progress.unmatched_pairs", unmatched_pairs}, {"progress.rollout_length", rollout_length},
-                 {"progress.rollout_return", rollout_return}, {"progress.rollouts", rollouts}, {"progress.eval_length", eval_length},
-                 {"progress.eval_return", eval_return}})
+        for (auto [name, field] :
+             std::initializer_list<std::pair<const char*, double&>>{{"progress.loss", loss},
+                                                                    {"progress.entropy", entropy},
+                                                                    {"progress.gradient_norm", gradient_norm},
+                                                                    {"progress.summed_updates", summed_updates},
+                                                                    {"progress.pairs", pairs},
+                                                                    {"progress.short_pairs", short_pairs},
+                                                                    {"progress.unmatched_pairs", unmatched_pairs},
+                                                                    {"progress.rollout_length", rollout_length},
+                                                                    {"progress.rollout_return", rollout_return},
+                                                                    {"progress.rollouts", rollouts},
+                                                                    {"progress.eval_length", eval_length},
+                                                                    {"progress.eval_return", eval_return}})
             archive(name, field);
     }
 };
@@ -384,10 +408,14 @@ struct Run {
     Tape<float> tape;  // scratch, empty between updates
 
     Run(Compute& compute, const Settings& settings, const EnvironmentSpec& spec)
-        : agent{settings, spec, Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed)), {}},
+        : agent{settings,
+                spec,
+                Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed)),
+                {}},
           temperature(settings.initial_lambda),
           replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
-          memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)), tape(compute) {}
+          memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)),
+          tape(compute) {}
 
     Random random(Stream stream) const { return {static_cast<uint32_t>(agent.settings.seed), stream}; }
     bool remembers() const { return agent.settings.method == "wodtem"; }
@@ -398,7 +426,8 @@ struct Run {
 // From trajectories to what the network reads.
 
 void append_normalised(std::vector<float>& to, const Normaliser& normaliser, const float* state) {
-    for (size_t i = 0; i < normaliser.mean.size(); ++i) to.push_back((state[i] - normaliser.mean[i]) / normaliser.deviation[i]);
+    for (size_t i = 0; i < normaliser.mean.size(); ++i)
+        to.push_back((state[i] - normaliser.mean[i]) / normaliser.deviation[i]);
 }
 
 // Actions inside the open interval: atanh(1) is infinite. ODT's code.
@@ -406,7 +435,8 @@ float clamp_action(float a) { return std::clamp(a, -1.0f + 1e-6f, 1.0f - 1e-6f);
 
 void append_action_token(std::vector<float>& to, const EnvironmentSpec& spec, const float* action) {
     if (spec.moves > 0)
-        for (int move = 0; move < spec.moves; ++move) to.push_back(static_cast<float>(*action) == static_cast<float>(move) ? 1.0f : 0.0f);
+        for (int move = 0; move < spec.moves; ++move)
+            to.push_back(static_cast<float>(*action) == static_cast<float>(move) ? 1.0f : 0.0f);
     else
         for (int i = 0; i < spec.action_dim; ++i) to.push_back(clamp_action(action[i]));
 }
@@ -418,29 +448,32 @@ void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const fl
 // One update's data: n steps of batch_size windows, packed.
 struct Batch {
     SequenceBatch sequences;
-    std::vector<float> actions;             // [n, action_dim] a_c
-    std::vector<float> remembered;          // [n, action_dim] a-hat(s_c)
-    std::vector<double> discounted_returns; // [n] d_c
-    std::vector<const float*> raw_states;   // [n] s_c, in the replay buffer
-    std::vector<float> mean;                // [n] 1 / (windows |C^t|): the mean over a window's steps, then over windows
-    std::vector<float> weights;             // [n] w(s_c, a_c)
+    std::vector<float> actions;              // [n, action_dim] a_c
+    std::vector<float> remembered;           // [n, action_dim] a-hat(s_c)
+    std::vector<double> discounted_returns;  // [n] d_c
+    std::vector<const float*> raw_states;    // [n] s_c, in the replay buffer
+    std::vector<float> mean;     // [n] 1 / (windows |C^t|): the mean over a window's steps, then over windows
+    std::vector<float> weights;  // [n] w(s_c, a_c)
 };
 
-// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t = the steps of the window.
-// departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up to t.
+// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t = the steps of the
+// window. departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up
+// to t.
 Batch sample_batch(const Run& run) {
     const Settings& settings = run.agent.settings;
     const EnvironmentSpec& spec = run.agent.spec;
     Batch batch;
     for (uint32_t window = 0; window < settings.batch_size; ++window) {
-        const Window at = run.replay.sample(run.random(Stream::batch), run.progress.updates, window, static_cast<int>(settings.context_length));
+        const Window at = run.replay.sample(run.random(Stream::batch), run.progress.updates, window,
+                                            static_cast<int>(settings.context_length));
         const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
         batch.sequences.lengths.push_back(at.length);
         for (int t = at.start; t < at.start + at.length; ++t) {
             const size_t step = static_cast<size_t>(t);
             const float* state = &trajectory.states[step * static_cast<size_t>(spec.state_dim)];
             const float* action = &trajectory.actions[step * static_cast<size_t>(spec.action_dim)];
-            batch.sequences.returns_to_go.push_back(static_cast<float>(trajectory.returns_to_go[step] * settings.reward_scale));
+            batch.sequences.returns_to_go.push_back(
+                static_cast<float>(trajectory.returns_to_go[step] * settings.reward_scale));
             append_normalised(batch.sequences.states, run.agent.normaliser, state);
             append_action_token(batch.sequences.actions, spec, action);
             batch.sequences.timesteps.push_back(t);
@@ -477,8 +510,8 @@ void remember(Run& run, Trajectory trajectory) {
     run.memory.update(trajectory);
 }
 
-// WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each batch.
-// Without a neighbour there is nothing against a_c: w = 1.
+// WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each
+// batch. Without a neighbour there is nothing against a_c: w = 1.
 void consult_memory(Run& run, Batch& batch) {
     if (!run.remembers()) return;
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
@@ -490,7 +523,8 @@ void consult_memory(Run& run, Batch& batch) {
         batch.weights[i] = static_cast<float>(run.memory.weight(found, d, run.agent.settings.alpha));
         if (run.memory.is_optimal(found, d)) continue;
         run.progress.short_pairs += 1;
-        const float* action = run.memory.remembered_action(found, random.uniform(run.progress.updates, static_cast<uint32_t>(i)));
+        const float* action =
+            run.memory.remembered_action(found, random.uniform(run.progress.updates, static_cast<uint32_t>(i)));
         for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
             batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
     }
@@ -528,8 +562,8 @@ struct Objective {
 
 // Equations (2), (3), (8) to (10) for one batch. `entropy_noise` [n, action_dim]: for the Gaussian head only.
 template <class T>
-Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const Batch& batch, const float* entropy_noise, float lambda,
-                       bool constrain_entropy) {
+Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const Batch& batch,
+                       const float* entropy_noise, float lambda, bool constrain_entropy) {
     const size_t n = batch.mean.size();
     std::vector<float> observed(n), advised(n);
     for (size_t i = 0; i < n; ++i) {
@@ -537,11 +571,13 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
         advised[i] = -batch.mean[i] * (1.0f - batch.weights[i]);
     }
     Objective<T> result;
-    // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat(s_c) | s^c, g^c) ]
-    // WODTEM eq. (2): J is L with w = 1. Both terms read the same distribution; the action tokens stay the buffer's.
-    // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over all steps.
-    result.likelihood = combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()), T(1),
-                                weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
+    // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat(s_c) | s^c,
+    // g^c) ] WODTEM eq. (2): J is L with w = 1. Both terms read the same distribution; the action tokens stay the
+    // buffer's. departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over
+    // all steps.
+    result.likelihood =
+        combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()),
+                T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
     if (!constrain_entropy) {
         result.loss = result.likelihood;
         return result;
@@ -554,14 +590,16 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     return result;
 }
 
-// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar). Its gradient in log lambda is lambda (eta - H-bar).
+// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar). Its gradient in log lambda is lambda (eta -
+// H-bar).
 void update_lambda(Run& run, Compute& compute, double entropy) {
     OptimizerConfig config;
     config.rule = OptimizerConfig::Rule::adamw;
     config.learning_rate = run.agent.settings.lambda_learning_rate;
     config.weight_decay = config.clip_norm = 0;
     config.warmup_updates = 0;
-    run.temperature.log_lambda[0].gradient[0] = static_cast<float>(-run.temperature.lambda() * (run.agent.settings.eta - entropy));
+    run.temperature.log_lambda[0].gradient[0] =
+        static_cast<float>(-run.temperature.lambda() * (run.agent.settings.eta - entropy));
     update_parameters(compute, run.temperature.log_lambda, run.temperature.optimizer, config);
 }
 
@@ -581,10 +619,12 @@ void update(Run& run) {
     for (uint32_t i = 0; head == Head::squashed_gaussian && i < batch.actions.size(); ++i)
         noise.push_back(run.random(Stream::entropy_noise).normal(run.progress.updates, i));
     const Policy<float> policy = forward(tape, run.agent.model, batch.sequences, Ask::every_state);
-    const Objective<float> result = objective(tape, head, policy, batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
+    const Objective<float> result =
+        objective(tape, head, policy, batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
     if (!std::isfinite(result.loss.value[0])) fail("nn.not_finite", "the loss is not finite");
     tape.backward(result.loss);
-    run.progress.gradient_norm += update_parameters(compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
+    run.progress.gradient_norm +=
+        update_parameters(compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
     if (run.constrains_entropy()) {
         update_lambda(run, compute, result.entropy.value[0]);
         run.progress.entropy += result.entropy.value[0];
@@ -601,13 +641,14 @@ void update(Run& run) {
 enum class Act { sample, most_likely };  // online interaction; evaluation
 
 // The action of one row of the policy, as it is stored and stepped. Random: one stream, one number per dimension.
-std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act, const Random& random, uint64_t episode,
-                                 uint32_t t) {
+std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act,
+                                 const Random& random, uint64_t episode, uint32_t t) {
     const int columns = policy.mean.columns;
     const float* mean = policy.mean.value + static_cast<ptrdiff_t>(row) * columns;
     std::vector<float> action;
     if (agent.spec.moves > 0) {
-        if (act == Act::most_likely) return {static_cast<float>(std::max_element(mean, mean + columns) - mean)};  // ties: the first
+        if (act == Act::most_likely)
+            return {static_cast<float>(std::max_element(mean, mean + columns) - mean)};  // ties: the first
         double left = random.uniform(episode, t);
         int move = 0;
         while (move + 1 < columns && (left -= static_cast<double>(std::exp(mean[move]))) >= 0) ++move;
@@ -617,7 +658,8 @@ std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy
         const ptrdiff_t at = static_cast<ptrdiff_t>(row) * columns + i;
         float u = mean[i];
         if (agent.model.config.head == Head::squashed_gaussian) {
-            if (act == Act::sample) u += std::exp(policy.log_std.value[at]) * random.normal(episode, t, static_cast<uint32_t>(i));
+            if (act == Act::sample)
+                u += std::exp(policy.log_std.value[at]) * random.normal(episode, t, static_cast<uint32_t>(i));
             u = std::tanh(u);
         }
         action.push_back(clamp_action(u));
@@ -639,11 +681,13 @@ SequenceBatch acting_batch(const Agent& agent, const std::vector<Episode>& episo
     SequenceBatch batch;
     for (const Episode& episode : episodes) {
         if (episode.over) continue;
-        const int t = episode.trajectory.length(), first = std::max(0, t + 1 - static_cast<int>(agent.settings.eval_context));
+        const int t = episode.trajectory.length(),
+                  first = std::max(0, t + 1 - static_cast<int>(agent.settings.eval_context));
         batch.lengths.push_back(t + 1 - first);
         for (int c = first; c <= t; ++c) {
             const size_t step = static_cast<size_t>(c);
-            append_normalised(batch.states, agent.normaliser, c < t ? &episode.trajectory.states[step * S] : episode.state.data());
+            append_normalised(batch.states, agent.normaliser,
+                              c < t ? &episode.trajectory.states[step * S] : episode.state.data());
             batch.returns_to_go.push_back(episode.returns_to_go[step]);
             batch.timesteps.push_back(c);
             const std::vector<float> none(A);  // the present step has no action yet, and its token is never built
@@ -656,7 +700,8 @@ SequenceBatch acting_batch(const Agent& agent, const std::vector<Episode>& episo
 // Plays `count` episodes numbered from `first_episode` side by side, through the network as one batch.
 // WODTEM sec. III-B: g_1 = target; a_t from the policy (sampled, or the most likely one); g_{t+1} = g_t - r_t.
 template <class Environment>
-std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act, double target, uint64_t first_episode, int count) {
+std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act, double target, uint64_t first_episode,
+                                int count) {
     const Agent& agent = run.agent;
     const EnvironmentSpec& spec = agent.spec;
     std::vector<Environment> environments(static_cast<size_t>(count), prototype);
@@ -676,14 +721,16 @@ std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act,
         for (size_t i = 0; i < episodes.size(); ++i) {
             Episode& episode = episodes[i];
             if (episode.over) continue;
-            const std::vector<float> action = choose_action(agent, policy, row++, act, run.random(Stream::exploration), first_episode + i, t);
+            const std::vector<float> action =
+                choose_action(agent, policy, row++, act, run.random(Stream::exploration), first_episode + i, t);
             Trajectory& trajectory = episode.trajectory;
             trajectory.states.insert(trajectory.states.end(), episode.state.begin(), episode.state.end());
             trajectory.actions.insert(trajectory.actions.end(), action.begin(), action.end());
             const Step step = environments[i].step(action.data(), episode.state.data());
             trajectory.rewards.push_back(static_cast<float>(step.reward));
             trajectory.terminated = episode.over = step.terminated;
-            episode.returns_to_go.push_back(episode.returns_to_go.back() - static_cast<float>(step.reward * agent.settings.reward_scale));
+            episode.returns_to_go.push_back(episode.returns_to_go.back() -
+                                            static_cast<float>(step.reward * agent.settings.reward_scale));
         }
     }
     std::vector<Trajectory> trajectories;
@@ -732,10 +779,8 @@ struct Saver {
         file.add(name, {values.size()}, values);
     }
     template <class T>
-        requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T value) {
-        file.add(name, {}, std::array{value});
-    }
+    requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T value) { file.add(name, {}, std::array{value}); }
 };
 
 struct Loader {
@@ -747,10 +792,8 @@ struct Loader {
         values = file.get<T>(name, {n});
     }
     template <class T>
-        requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T& value) {
-        value = file.get<T>(name, {})[0];
-    }
+    requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T& value) { value = file.get<T>(name, {})[0]; }
 };
 
 // Everything in Run that is state, in the order of its members; saving and loading read the same list.
@@ -762,13 +805,18 @@ void visit_state(Archive& archive, Run& run) {
         state.first_moment.resize(parameters.size());
         state.second_moment.resize(parameters.size());
         for (size_t i = 0; i < parameters.size(); ++i) {
+            const size_t size = parameters[i].value.size();
             for (auto [part, values] : std::initializer_list<std::pair<const char*, std::vector<float>&>>{
-                     {".value.", parameters[i].value}, {".first_moment.", state.first_moment[i]}, {".second_moment.", state.second_moment[i]}}) {
-                const size_t before = parameters[i].value.size();
-                if (!Archive::loading) values.resize(before);  // moments that no update has touched yet are zeros
-                archive(name + part + parameters[i].name, values);
-                if (values.size() != before)
-                    fail("checkpoint.shape", "%s%s%s has %zu values, expected %zu", name.c_str(), part, parameters[i].name.c_str(), values.size(), before);
+                     {".value.", parameters[i].value},
+                     {".first_moment.", state.first_moment[i]},
+                     {".second_moment.", state.second_moment[i]}}) {
+                values.resize(size);  // moments that no update has touched yet are zeros
+                std::vector<float> saved = values;
+                archive(name + part + parameters[i].name, saved);
+                if (saved.size() != size)
+                    fail("checkpoint.shape", "%s%s%s has %zu values, expected %zu", name.c_str(), part,
+                         parameters[i].name.c_str(), saved.size(), size);
+                std::copy(saved.begin(), saved.end(), values.begin());  // in place: the network's tensors point there
             }
         }
     };
@@ -776,7 +824,8 @@ void visit_state(Archive& archive, Run& run) {
     archive("normaliser.mean", run.agent.normaliser.mean);
     archive("normaliser.deviation", run.agent.normaliser.deviation);
     optimizer("temperature", run.temperature.log_lambda, run.temperature.optimizer);
-    if (Archive::loading && run.progress.online == 0) run.replay.capacity = static_cast<size_t>(run.agent.settings.data_trajectories);
+    if (Archive::loading && run.progress.online == 0)
+        run.replay.capacity = static_cast<size_t>(run.agent.settings.data_trajectories);
     run.replay.visit(archive);
     run.memory.visit(archive);
 }
@@ -819,7 +868,8 @@ void save_model(const Run& run, const std::string& path) {
     file.metadata["settings"] = settings_text(run.agent.settings);
     file.metadata["updates"] = std::to_string(run.progress.updates);
     file.metadata["interactions"] = std::to_string(run.progress.interactions);
-    for (const Parameter<float>& parameter : run.agent.model.parameters) file.add(parameter.name, parameter.shape, parameter.value);
+    for (const Parameter<float>& parameter : run.agent.model.parameters)
+        file.add(parameter.name, parameter.shape, parameter.value);
     const Parameter<float>& log_lambda = run.temperature.log_lambda[0];
     file.add(log_lambda.name, {}, log_lambda.value);
     file.add("state_mean", {run.agent.normaliser.mean.size()}, run.agent.normaliser.mean);
@@ -828,12 +878,14 @@ void save_model(const Run& run, const std::string& path) {
 }
 
 void load_model(Run& run, const TensorFile& file) {
-    for (Parameter<float>& parameter : run.agent.model.parameters) file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
+    for (Parameter<float>& parameter : run.agent.model.parameters)
+        file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
     const uint64_t S = static_cast<uint64_t>(run.agent.spec.state_dim);
     run.agent.normaliser = {file.get<float>("state_mean", {S}), file.get<float>("state_std", {S})};
     for (const Parameter<float>& parameter : run.agent.model.parameters)
         for (const float value : parameter.value)
-            if (!std::isfinite(value)) fail("model.not_finite", "%s: tensor %s is not finite", file.path.c_str(), parameter.name.c_str());
+            if (!std::isfinite(value))
+                fail("model.not_finite", "%s: tensor %s is not finite", file.path.c_str(), parameter.name.c_str());
 }
 
 std::string csv_line(const std::vector<std::string>& fields) {
@@ -853,7 +905,9 @@ struct Console {
     int tenth = -1;
     std::string label, phase;
 
-    static double seconds_between(Clock::time_point a, Clock::time_point b) { return std::chrono::duration<double>(b - a).count(); }
+    static double seconds_between(Clock::time_point a, Clock::time_point b) {
+        return std::chrono::duration<double>(b - a).count();
+    }
 
     // share: of the phase, 0 to 1.
     void show(const Run& run, const std::string& new_phase, double share) {
@@ -869,13 +923,20 @@ struct Console {
         const double updates = std::max(1.0, p.summed_updates);
         const int width = 20, filled = static_cast<int>(share * width);
         std::string text = label + " " + phase;
-        if (terminal) text += " [" + std::string(static_cast<size_t>(filled), '#') + std::string(static_cast<size_t>(width - filled), '.') + "]";
+        if (terminal)
+            text += " [" + std::string(static_cast<size_t>(filled), '#') +
+                    std::string(static_cast<size_t>(width - filled), '.') + "]";
         char numbers[256];
-        std::snprintf(numbers, sizeof numbers, " %3.0f%%  update %llu  interactions %llu  loss %.3f  entropy %.3f  length %.4g  return %.3g  %.0f updates/s",
-                      100 * share, static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.interactions), p.loss / updates,
-                      p.entropy / updates, p.eval_length, p.eval_return, static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_between(began, now)));
+        std::snprintf(
+            numbers, sizeof numbers,
+            " %3.0f%%  update %llu  interactions %llu  loss %.3f  entropy %.3f  length %.4g  return %.3g  %.0f updates/s",
+            100 * share, static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.interactions),
+            p.loss / updates, p.entropy / updates, p.eval_length, p.eval_return,
+            static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_between(began, now)));
         text += numbers;
-        if (std::isfinite(left)) std::snprintf(numbers, sizeof numbers, "  %d:%02d left", static_cast<int>(left) / 60, static_cast<int>(left) % 60);
+        if (std::isfinite(left))
+            std::snprintf(numbers, sizeof numbers, "  %d:%02d left", static_cast<int>(left) / 60,
+                          static_cast<int>(left) % 60);
         if (std::isfinite(left)) text += numbers;
         std::fprintf(stderr, terminal ? "\r%s\033[K" : "%s\n", text.c_str());
         if (terminal && share >= 1) std::fprintf(stderr, "\n");
@@ -928,18 +989,24 @@ void update_and_watch(Run& run, Session<Environment>& session) {
 template <class Environment>
 void evaluate_and_record(Run& run, Session<Environment>& session) {
     Progress& p = run.progress;
-    const Evaluation evaluation = evaluate(run, session.environment, p.evaluations, static_cast<int>(run.agent.settings.eval_episodes));
+    const Evaluation evaluation =
+        evaluate(run, session.environment, p.evaluations, static_cast<int>(run.agent.settings.eval_episodes));
     p.eval_length = evaluation.mean_length;
     p.eval_return = evaluation.mean_return;
-    const double learning_rate = run.agent.settings.learning_rate *
-                                 warmup_factor(std::max<uint64_t>(1, p.updates) - 1, static_cast<uint64_t>(run.agent.settings.warmup_updates));
-    const auto mean = [](double sum, double count) { return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan"); };
+    const double learning_rate =
+        run.agent.settings.learning_rate *
+        warmup_factor(std::max<uint64_t>(1, p.updates) - 1, static_cast<uint64_t>(run.agent.settings.warmup_updates));
+    const auto mean = [](double sum, double count) {
+        return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");
+    };
     const std::string line = csv_line(
-        {p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions), std::to_string(p.episodes),
-         number_text(learning_rate), mean(p.loss, p.summed_updates), mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
-         number_text(run.constrains_entropy() ? static_cast<double>(run.temperature.lambda()) : 0.0), mean(p.gradient_norm, p.summed_updates),
-         mean(p.short_pairs, p.pairs), mean(p.unmatched_pairs, p.pairs), std::to_string(run.memory.size()), number_text(p.eval_length),
-         number_text(p.eval_return), number_text(p.eval_return), mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
+        {p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions),
+         std::to_string(p.episodes), number_text(learning_rate), mean(p.loss, p.summed_updates),
+         mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
+         number_text(run.constrains_entropy() ? static_cast<double>(run.temperature.lambda()) : 0.0),
+         mean(p.gradient_norm, p.summed_updates), mean(p.short_pairs, p.pairs), mean(p.unmatched_pairs, p.pairs),
+         std::to_string(run.memory.size()), number_text(p.eval_length), number_text(p.eval_return),
+         number_text(p.eval_return), mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
     AppendFile(session.folder.file("progress.csv")).append(line);
     p.progress_bytes += line.size();
     p.evaluations += 1;
@@ -959,12 +1026,13 @@ void offline_phase(Run& run, Session<Environment>& session) {
     evaluate_and_record(run, session);
 }
 
-// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout); it enters
-// D_online first in, first out, and the table at once, before the updates that follow it.
+// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout); it
+// enters D_online first in, first out, and the table at once, before the updates that follow it.
 template <class Environment>
 void interact(Run& run, Session<Environment>& session) {
     Progress& p = run.progress;
-    std::vector<Trajectory> episodes = rollout(run, session.environment, Act::sample, run.agent.settings.g_online, p.episodes, 1);
+    std::vector<Trajectory> episodes =
+        rollout(run, session.environment, Act::sample, run.agent.settings.g_online, p.episodes, 1);
     Trajectory& episode = episodes[0];
     p.episodes += 1;
     p.interactions += static_cast<uint64_t>(episode.length());
@@ -972,9 +1040,11 @@ void interact(Run& run, Session<Environment>& session) {
     p.rollout_length += episode.length();
     p.rollout_return += total_return(episode);
     std::string moves;
-    for (size_t t = 0; run.agent.spec.moves > 0 && t < episode.actions.size(); ++t) moves += static_cast<char>('0' + static_cast<int>(episode.actions[t]));
-    const std::string line = csv_line({std::to_string(p.episodes), std::to_string(p.interactions), std::to_string(episode.length()),
-                                       number_text(total_return(episode)), episode.terminated ? "1" : "0", moves});
+    for (size_t t = 0; run.agent.spec.moves > 0 && t < episode.actions.size(); ++t)
+        moves += static_cast<char>('0' + static_cast<int>(episode.actions[t]));
+    const std::string line =
+        csv_line({std::to_string(p.episodes), std::to_string(p.interactions), std::to_string(episode.length()),
+                  number_text(total_return(episode)), episode.terminated ? "1" : "0", moves});
     AppendFile(session.folder.file("episodes.csv")).append(line);
     p.episodes_bytes += line.size();
     remember(run, episode);
@@ -994,11 +1064,13 @@ void online_phase(Run& run, Session<Environment>& session) {
     }
     const uint64_t budget = static_cast<uint64_t>(settings.online_steps);
     while (true) {
-        const uint64_t owed = static_cast<uint64_t>(settings.offline_updates) + p.episodes * static_cast<uint64_t>(settings.updates_per_iteration);
+        const uint64_t owed = static_cast<uint64_t>(settings.offline_updates) +
+                              p.episodes * static_cast<uint64_t>(settings.updates_per_iteration);
         while (p.updates < owed) update_and_watch(run, session);
         const bool last = p.interactions >= budget;
         if (p.episodes >= p.next_evaluation || last) evaluate_and_record(run, session);
-        session.console.show(run, "online", std::min(1.0, static_cast<double>(p.interactions) / static_cast<double>(budget)));
+        session.console.show(run, "online",
+                             std::min(1.0, static_cast<double>(p.interactions) / static_cast<double>(budget)));
         if (last) return;
         interact(run, session);
     }
@@ -1021,8 +1093,9 @@ GridWorld make_environment(const Settings& settings) {
 }
 
 std::vector<Trajectory> make_data_set(const Settings& settings, const GridWorld& world) {
-    std::vector<Trajectory> trajectories = collect_data_set(world, static_cast<Behaviour>(choice(behaviour_names, settings.behaviour)),
-                                                            static_cast<uint32_t>(settings.data_seed), static_cast<int>(settings.data_trajectories));
+    std::vector<Trajectory> trajectories =
+        collect_data_set(world, static_cast<Behaviour>(choice(behaviour_names, settings.behaviour)),
+                         static_cast<uint32_t>(settings.data_seed), static_cast<int>(settings.data_trajectories));
     const EnvironmentSpec spec = world.spec();
     for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
     return trajectories;
@@ -1044,7 +1117,8 @@ std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
     run.tape.recording = false;
     const Policy<float> policy = forward(run.tape, run.agent.model, batch, Ask::last_state);
     std::vector<std::vector<float>> probabilities(grid_cells);
-    for (size_t i = 0; i < policy.mean.size(); ++i) probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
+    for (size_t i = 0; i < policy.mean.size(); ++i)
+        probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
     return probabilities;
 }
 
@@ -1057,7 +1131,8 @@ std::vector<double> moves_at_start(const std::vector<Trajectory>& trajectories, 
     double visits = 0;
     for (const Trajectory& trajectory : trajectories)
         for (size_t t = 0; t < trajectory.actions.size(); ++t)
-            if (std::equal(start.begin(), start.end(), trajectory.states.begin() + static_cast<ptrdiff_t>(t * start.size())))
+            if (std::equal(start.begin(), start.end(),
+                           trajectory.states.begin() + static_cast<ptrdiff_t>(t * start.size())))
                 shares[static_cast<size_t>(trajectory.actions[t])] += 1, visits += 1;
     for (double& share : shares) share /= std::max(1.0, visits);
     return shares;
@@ -1073,11 +1148,12 @@ void save_grid_results(Run& run, const GridWorld& world, const RunFolder& folder
         for (const float p : policy[static_cast<size_t>(cell)]) fields.push_back(number_text(p));
         cells += csv_line(fields);
     }
-    const std::vector<double> offline = moves_at_start(make_data_set(run.agent.settings, world), world, run.agent.spec.state_dim);
+    const std::vector<double> offline =
+        moves_at_start(make_data_set(run.agent.settings, world), world, run.agent.spec.state_dim);
     const std::vector<double> online = moves_at_start(run.replay.trajectories, world, run.agent.spec.state_dim);
     for (size_t move = 0; move < grid_moves; ++move)
-        start += csv_line({grid_move_table[move].name, number_text(policy[grid_start][move]), number_text(offline[move]),
-                           run.progress.online != 0 ? number_text(online[move]) : "nan"});
+        start += csv_line({grid_move_table[move].name, number_text(policy[grid_start][move]),
+                           number_text(offline[move]), run.progress.online != 0 ? number_text(online[move]) : "nan"});
     write_file_atomic(folder.file("policy.csv"), cells);
     write_file_atomic(folder.file("start_actions.csv"), start);
 }
@@ -1098,11 +1174,13 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
 void claim_folder(const Settings& settings, const RunFolder& folder) {
     std::error_code problem;
     fs::create_directories(folder.path, problem);
-    if (problem) fail("run.folder", "cannot make the run folder %s: %s", folder.path.c_str(), problem.message().c_str());
+    if (problem)
+        fail("run.folder", "cannot make the run folder %s: %s", folder.path.c_str(), problem.message().c_str());
     const std::string path = folder.file("settings");
     if (!fs::exists(path)) {
         if (fs::exists(folder.file("progress.csv")) || fs::exists(folder.file("checkpoint.safetensors")))
-            fail("run.folder", "%s holds a run without its settings file; choose another folder with --out", folder.path.c_str());
+            fail("run.folder", "%s holds a run without its settings file; choose another folder with --out",
+                 folder.path.c_str());
         write_file_atomic(path, settings_text(settings));
         return;
     }
@@ -1111,8 +1189,10 @@ void claim_folder(const Settings& settings, const RunFolder& folder) {
         const std::string was = setting_text(found, row), wanted = setting_text(settings, row);
         if (was == wanted) continue;
         const bool kernel = std::string(row.name) == "arithmetic";
-        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", folder.path.c_str(), row.name, was.c_str(), wanted.c_str(),
-             kernel ? "choose the kernel it was begun with (--kernel)" : "choose another folder with --out, or the same settings");
+        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", folder.path.c_str(),
+             row.name, was.c_str(), wanted.c_str(),
+             kernel ? "choose the kernel it was begun with (--kernel)"
+                    : "choose another folder with --out, or the same settings");
     }
 }
 
@@ -1134,7 +1214,8 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     Run run(compute, settings, session.environment.spec());
     if (fs::exists(session.folder.file("checkpoint.safetensors"))) {
         load_checkpoint(run, session.folder);
-        std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(), static_cast<unsigned long long>(run.progress.updates));
+        std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(),
+                     static_cast<unsigned long long>(run.progress.updates));
     } else {
         begin_run(run, make_data_set(settings, session.environment));
         write_file_atomic(session.folder.file("progress.csv"), progress_header);
@@ -1150,7 +1231,8 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     write_file_atomic(session.folder.file("finished"), "");
     fs::remove(session.folder.file("checkpoint.safetensors"));
     std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s\n", path.c_str(),
-                static_cast<unsigned long long>(run.progress.updates), static_cast<unsigned long long>(run.progress.interactions),
+                static_cast<unsigned long long>(run.progress.updates),
+                static_cast<unsigned long long>(run.progress.interactions),
                 number_text(run.progress.eval_length).c_str(), number_text(run.progress.eval_return).c_str());
 }
 
@@ -1184,17 +1266,20 @@ const Option method_option = {"--method", "NAME", "wodtem", "dt, odt or wodtem"}
 const Option preset_option = {"--preset", "NAME", "small", "paper: Table I as printed; small: a narrower network"};
 const Option seed_option = {"--seed", "N", "0", "seed of everything but the data set"};
 const Option seeds_option = {"--seeds", "A-B", "", "several seeds, one after the other"};
-const Option set_option = {"--set", "NAME=VALUE", "", "any setting (see `wodtem info` of a run's model); may be repeated"};
-const Option kernel_option = {"--kernel", "NAME", "auto", "matrix kernel: avx512, avx2, portable, or the best there is"};
+const Option set_option = {"--set", "NAME=VALUE", "",
+                           "any setting (see `wodtem info` of a run's model); may be repeated"};
+const Option kernel_option = {"--kernel", "NAME", "auto",
+                              "matrix kernel: avx512, avx2, portable, or the best there is"};
 const Option threads_option = {"--threads", "N", "0", "worker threads; 0: one per core; results do not depend on it"};
 
 // Errors: usage.number.
 int64_t whole_number(const std::string& text, const char* name, int64_t low, int64_t high) {
     const std::optional<double> x = to_number(text);
     if (!x || *x != std::floor(*x) || *x < static_cast<double>(low) || *x > static_cast<double>(high)) {
-        const double nearest = std::clamp(x.value_or(static_cast<double>(low)), static_cast<double>(low), static_cast<double>(high));
-        fail("usage.number", "%s cannot be \"%s\"; it is a whole number from %lld to %lld; the nearest is %.0f", name, text.c_str(),
-             static_cast<long long>(low), static_cast<long long>(high), std::round(nearest));
+        const double nearest =
+            std::clamp(x.value_or(static_cast<double>(low)), static_cast<double>(low), static_cast<double>(high));
+        fail("usage.number", "%s cannot be \"%s\"; it is a whole number from %lld to %lld; the nearest is %.0f", name,
+             text.c_str(), static_cast<long long>(low), static_cast<long long>(high), std::round(nearest));
     }
     return static_cast<int64_t>(*x);
 }
@@ -1205,8 +1290,10 @@ std::vector<int64_t> seed_list(const std::string& text) {
     for (const std::string& part : split(text, ',')) {
         const size_t dash = part.find('-', 1);
         const int64_t first = whole_number(part.substr(0, dash), "a seed", 0, 4294967295);
-        const int64_t last = dash == std::string::npos ? first : whole_number(part.substr(dash + 1), "a seed", 0, 4294967295);
-        if (last < first || last - first > 9999) fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", part.c_str());
+        const int64_t last =
+            dash == std::string::npos ? first : whole_number(part.substr(dash + 1), "a seed", 0, 4294967295);
+        if (last < first || last - first > 9999)
+            fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", part.c_str());
         for (int64_t seed = first; seed <= last; ++seed) seeds.push_back(seed);
     }
     return seeds;
@@ -1224,11 +1311,14 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
     std::set<std::string> seen;
     for (const std::string& assignment : arguments.assignments) {
         const size_t equals = assignment.find('=');
-        if (equals == std::string::npos) fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
+        if (equals == std::string::npos)
+            fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
         const std::string name = assignment.substr(0, equals);
         const std::string row = setting_row(name).name;
         for (const char* fixed : {"task", "method", "preset", "seed", "arithmetic"})
-            if (row == fixed) fail("usage.setting", "%s is not given by --set; use its own argument (see wodtem train --help)", fixed);
+            if (row == fixed)
+                fail("usage.setting", "%s is not given by --set; use its own argument (see wodtem train --help)",
+                     fixed);
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
     }
@@ -1237,21 +1327,24 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
 }
 
 std::string default_folder(const Settings& settings) {
-    return "runs/" + settings.task + "-" + settings.preset + "-" + settings.method + "-" + std::to_string(settings.seed);
+    return "runs/" + settings.task + "-" + settings.preset + "-" + settings.method + "-" +
+           std::to_string(settings.seed);
 }
 
 void command_train(const Arguments& arguments) {
     TrainOptions options;
     options.kernel = arguments["--kernel"];
     options.threads = thread_count(arguments);
-    options.checkpoint_every = static_cast<double>(whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400));
+    options.checkpoint_every =
+        static_cast<double>(whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400));
     const bool several = !arguments["--seeds"].empty();
     for (const int64_t seed : seed_list(several ? arguments["--seeds"] : arguments["--seed"])) {
         const Settings settings = asked_settings(arguments, seed);
         std::string folder = arguments["--out"].empty() ? default_folder(settings) : arguments["--out"];
         if (several && !arguments["--out"].empty()) folder += "/seed-" + std::to_string(seed);
         std::string line;
-        for (const SettingRow& row : setting_rows) line += std::string(" ") + row.name + "=" + setting_text(settings, row);
+        for (const SettingRow& row : setting_rows)
+            line += std::string(" ") + row.name + "=" + setting_text(settings, row);
         std::fprintf(stderr, "%s:%s\n", folder.c_str(), line.c_str());
         train(settings, folder, options);
     }
@@ -1282,11 +1375,13 @@ void command_eval(const Arguments& arguments) {
     LoadedModel model = open_model(arguments.words[0], arguments);
     const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 1000000));
     const Evaluation evaluation = evaluate(*model.run, model.environment, 0, count);
-    std::printf("%s, %s, seed %lld: mean length %s, mean return %s over %d episode%s\n", model.settings.task.c_str(), model.settings.method.c_str(),
-                static_cast<long long>(model.settings.seed), number_text(evaluation.mean_length).c_str(), number_text(evaluation.mean_return).c_str(),
-                count, count == 1 ? "" : "s");
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s over %d episode%s\n", model.settings.task.c_str(),
+                model.settings.method.c_str(), static_cast<long long>(model.settings.seed),
+                number_text(evaluation.mean_length).c_str(), number_text(evaluation.mean_return).c_str(), count,
+                count == 1 ? "" : "s");
     std::printf("first episode:");
-    for (const float move : evaluation.episodes[0].actions) std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
+    for (const float move : evaluation.episodes[0].actions)
+        std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
     std::printf("\n");
 }
 
@@ -1300,9 +1395,10 @@ void command_sweep(const Arguments& arguments) {
     const std::vector<std::string> methods = split(arguments["--methods"], ',');
     for (const std::string& method : methods)
         for (const int64_t seed : seed_list(arguments["--seeds"])) {
-            const Settings settings = default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0], method, arguments["--preset"]);
-            std::printf("./wodtem train %s --method %s --preset %s --seed %lld\n", settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
-                        static_cast<long long>(seed));
+            const Settings settings = default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0],
+                                                       method, arguments["--preset"]);
+            std::printf("./wodtem train %s --method %s --preset %s --seed %lld\n", settings.task.c_str(),
+                        settings.method.c_str(), settings.preset.c_str(), static_cast<long long>(seed));
         }
 }
 
@@ -1321,8 +1417,8 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
         low = std::min(low, x), high = std::max(high, x), sum += x;
     }
     char text[160];
-    std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g%s", low, high, sum / static_cast<double>(values.size() - bad),
-                  bad > 0 ? ", NOT FINITE: " : "");
+    std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g%s", low, high,
+                  sum / static_cast<double>(values.size() - bad), bad > 0 ? ", NOT FINITE: " : "");
     return text + (bad > 0 ? std::to_string(bad) : std::string());
 }
 
@@ -1332,7 +1428,8 @@ void command_info(const Arguments& arguments) {
     std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), bytes.size(), hex8(crc32(bytes)).c_str());
     const TensorFile file = parse_safetensors(bytes, path);
     for (const auto& [key, text] : file.metadata)
-        std::printf("%s%s%s%s", key.c_str(), text.find('\n') == std::string::npos ? ": " : ":\n", text.c_str(), text.ends_with('\n') ? "" : "\n");
+        std::printf("%s%s%s%s", key.c_str(), text.find('\n') == std::string::npos ? ": " : ":\n", text.c_str(),
+                    text.ends_with('\n') ? "" : "\n");
     for (const StoredTensor& tensor : file.tensors) {
         std::string range;
         if (tensor.dtype == DType::F32) range = value_range<float>(file, tensor);
@@ -1341,15 +1438,17 @@ void command_info(const Arguments& arguments) {
         if (tensor.dtype == DType::U32) range = value_range<uint32_t>(file, tensor);
         if (tensor.dtype == DType::U64) range = value_range<uint64_t>(file, tensor);
         if (tensor.dtype == DType::I64) range = value_range<int64_t>(file, tensor);
-        std::printf("%-44s %s %-14s %s\n", tensor.name.c_str(), about(tensor.dtype).name, shape_text(tensor.shape).c_str(), range.c_str());
+        std::printf("%-44s %s %-14s %s\n", tensor.name.c_str(), about(tensor.dtype).name,
+                    shape_text(tensor.shape).c_str(), range.c_str());
     }
 }
 
 void command_tasks(const Arguments&) {
     std::printf("%-12s %-10s %-8s %-8s %s\n", "task", "state", "actions", "steps", "data set");
     const EnvironmentSpec spec = GridWorld{}.spec();
-    std::printf("%-12s %-10d %-8d %-8d %d trajectories of a fixed policy, made on the spot (behaviour: right_down, or left_down)\n", "gridworld",
-                spec.state_dim, spec.moves, spec.max_episode_steps, 500);
+    std::printf(
+        "%-12s %-10d %-8d %-8d %d trajectories of a fixed policy, made on the spot (behaviour: right_down, or left_down)\n",
+        "gridworld", spec.state_dim, spec.moves, spec.max_episode_steps, 500);
 }
 
 // ---- bench
@@ -1380,17 +1479,21 @@ void bench_products(const Kernel& kernel) {
     const double burn = 2e9 / burn_flops(kernel);
     const Spread peak = timed(7, [&] { sink = sink + kernel.burn(static_cast<int64_t>(burn)); });
     const double peak_rate = 2e9 / peak.low / 1e9;
-    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only; median %.1f)\n", kernel.name, peak_rate, 2e9 / peak.median / 1e9);
+    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only; median %.1f)\n", kernel.name, peak_rate,
+                2e9 / peak.median / 1e9);
     struct Case {
         const char* what;
         int M, N, K;
         bool a_transposed, b_transposed;
     };
-    for (const Case& s : {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
-                           Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
-                           Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
-                           Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
-        const auto size = [](int rows, int columns) { return static_cast<size_t>(rows) * static_cast<size_t>(columns); };
+    for (const Case& s :
+         {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
+          Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
+          Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
+          Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
+        const auto size = [](int rows, int columns) {
+            return static_cast<size_t>(rows) * static_cast<size_t>(columns);
+        };
         const std::vector<float> a(size(s.M, s.K), 0.5f), b(size(s.K, s.N), 0.25f);
         std::vector<float> c(size(s.M, s.N));
         const double flops = 2.0 * s.M * s.N * s.K;
@@ -1401,8 +1504,9 @@ void bench_products(const Kernel& kernel) {
                        {b.data(), s.b_transposed ? s.K : s.N, s.b_transposed}, s.M, s.N, s.K, Store::overwrite);
         });
         const double rate = flops * repeats / time.median / 1e9;
-        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N, s.K, rate, 100 * rate / peak_rate,
-                    100 * flops * repeats / time.high / 1e9 / peak_rate, 100 * flops * repeats / time.low / 1e9 / peak_rate);
+        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N,
+                    s.K, rate, 100 * rate / peak_rate, 100 * flops * repeats / time.high / 1e9 / peak_rate,
+                    100 * flops * repeats / time.low / 1e9 / peak_rate);
     }
 }
 
@@ -1419,9 +1523,10 @@ void bench_update(const Kernel& kernel, int threads, const char* preset) {
         for (int i = 0; i < repeats; ++i) update(run);
     });
     const double flops = 84.0 * static_cast<double>(settings.width * settings.width * settings.batch_size) * repeats;
-    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n", preset,
-                static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s", time.median / repeats * 1e3, time.low / repeats * 1e3,
-                time.high / repeats * 1e3, flops / time.median / 1e9);
+    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n",
+                preset, static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s",
+                time.median / repeats * 1e3, time.low / repeats * 1e3, time.high / repeats * 1e3,
+                flops / time.median / 1e9);
 }
 
 // Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
@@ -1454,9 +1559,11 @@ void bench_memory(size_t entries) {
             memory.neighbours(state.data());
         }
     });
-    std::printf("  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
-                entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6, insertion / static_cast<double>(entries) * 1e6,
-                build, static_cast<double>(memory.bytes()) / static_cast<double>(entries));
+    std::printf(
+        "  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
+        entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6,
+        insertion / static_cast<double>(entries) * 1e6, build,
+        static_cast<double>(memory.bytes()) / static_cast<double>(entries));
 }
 
 void command_bench(const Arguments& arguments) {
@@ -1473,16 +1580,52 @@ void command_bench(const Arguments& arguments) {
 
 const std::vector<Command>& commands() {
     static const std::vector<Command> list = {
-        {"train", "TASK", 1, 1, "offline phase, online phase, evaluations; continues what is there",
-         {method_option, preset_option, seed_option, seeds_option, set_option, {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
-          kernel_option, threads_option, {"--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"}},
+        {"train",
+         "TASK",
+         1,
+         1,
+         "offline phase, online phase, evaluations; continues what is there",
+         {method_option,
+          preset_option,
+          seed_option,
+          seeds_option,
+          set_option,
+          {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
+          kernel_option,
+          threads_option,
+          {"--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"}},
          command_train},
-        {"eval", "MODEL", 1, 1, "evaluate a saved model; needs nothing else", {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option}, command_eval},
-        {"report", "DIR...", 1, 10000, "tables and figures of runs: one HTML file, SVG files, Markdown", {{"--out", "DIR", "runs/report", "where to write"}}, command_report},
-        {"sweep", "[TASK]", 0, 1, "print one train command per method and seed, for any job runner",
-         {{"--methods", "LIST", "dt,odt,wodtem", "methods, separated by commas"}, {"--seeds", "A-B", "0-4", "seeds"}, preset_option}, command_sweep},
+        {"eval",
+         "MODEL",
+         1,
+         1,
+         "evaluate a saved model; needs nothing else",
+         {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option},
+         command_eval},
+        {"report",
+         "DIR...",
+         1,
+         10000,
+         "tables and figures of runs: one HTML file, SVG files, Markdown",
+         {{"--out", "DIR", "runs/report", "where to write"}},
+         command_report},
+        {"sweep",
+         "[TASK]",
+         0,
+         1,
+         "print one train command per method and seed, for any job runner",
+         {{"--methods", "LIST", "dt,odt,wodtem", "methods, separated by commas"},
+          {"--seeds", "A-B", "0-4", "seeds"},
+          preset_option},
+         command_sweep},
         {"info", "FILE", 1, 1, "what is in a model or checkpoint: names, shapes, ranges, checksum", {}, command_info},
-        {"bench", "", 0, 0, "the machine's peak, each kernel's share of it, update and look-up times", {kernel_option, threads_option}, command_bench},
+        {"bench",
+         "",
+         0,
+         0,
+         "the machine's peak, each kernel's share of it, update and look-up times",
+         {kernel_option, threads_option},
+         command_bench},
         {"tasks", "", 0, 0, "list tasks and data sets", {}, command_tasks},
     };
     return list;
@@ -1490,7 +1633,8 @@ const std::vector<Command>& commands() {
 
 void print_help(const Command* command) {
     if (!command) {
-        std::printf("wodtem: decision transformers that go from offline data to online interaction, with an episodic memory\n\n");
+        std::printf(
+            "wodtem: decision transformers that go from offline data to online interaction, with an episodic memory\n\n");
         for (const Command& c : commands()) std::printf("  wodtem %-7s%-9s %s\n", c.name, c.words, c.meaning);
         std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
         return;
@@ -1498,12 +1642,14 @@ void print_help(const Command* command) {
     std::printf("wodtem %s %s\n%s\n\n", command->name, command->words, command->meaning);
     for (const Option& option : command->options) {
         const std::string left = std::string(option.name) + " " + (option.value ? option.value : "");
-        std::printf("  %-26s %s%s%s\n", left.c_str(), option.meaning, *option.fallback ? "; default " : "", option.fallback);
+        std::printf("  %-26s %s%s%s\n", left.c_str(), option.meaning, *option.fallback ? "; default " : "",
+                    option.fallback);
     }
     if (std::string(command->name) == "train") {
         std::printf("\nSettings for --set, with the values of preset paper:\n");
         const Settings settings;
-        for (const SettingRow& row : setting_rows) std::printf("  %-24s %-12s %s\n", row.name, setting_text(settings, row).c_str(), row.source);
+        for (const SettingRow& row : setting_rows)
+            std::printf("  %-24s %-12s %s\n", row.name, setting_text(settings, row).c_str(), row.source);
     }
 }
 
@@ -1511,16 +1657,20 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
     Arguments arguments;
     std::set<std::string> seen;
     std::vector<std::string> names;
-    for (const Option& option : command.options) arguments.options[option.name] = option.fallback, names.push_back(option.name);
+    for (const Option& option : command.options)
+        arguments.options[option.name] = option.fallback, names.push_back(option.name);
     for (size_t i = 0; i < words.size(); ++i) {
         if (!words[i].starts_with("--")) {
             arguments.words.push_back(words[i]);
             continue;
         }
-        const auto option = std::find_if(command.options.begin(), command.options.end(), [&](const Option& o) { return words[i] == o.name; });
+        const auto option = std::find_if(command.options.begin(), command.options.end(),
+                                         [&](const Option& o) { return words[i] == o.name; });
         if (option == command.options.end()) {
-            if (names.empty()) fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
-            fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, words[i].c_str(), nearest_name(words[i], names).c_str());
+            if (names.empty())
+                fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
+            fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, words[i].c_str(),
+                 nearest_name(words[i], names).c_str());
         }
         if (i + 1 == words.size()) fail("usage.option", "option %s needs a value: %s", option->name, option->value);
         const std::string& value = words[++i];
@@ -1532,8 +1682,9 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
         arguments.options[option->name] = value;
     }
     if (arguments.words.size() < command.least_words || arguments.words.size() > command.most_words)
-        fail("usage.words", "wodtem %s takes %s; %zu argument%s given (wodtem %s --help)", command.name, *command.words ? command.words : "no argument",
-             arguments.words.size(), arguments.words.size() == 1 ? " was" : "s were", command.name);
+        fail("usage.words", "wodtem %s takes %s; %zu argument%s given (wodtem %s --help)", command.name,
+             *command.words ? command.words : "no argument", arguments.words.size(),
+             arguments.words.size() == 1 ? " was" : "s were", command.name);
     return arguments;
 }
 
@@ -1551,10 +1702,12 @@ int run_command_line(const std::vector<std::string>& words) {
             print_help(&command);
         else
             command.run(parse_arguments(command, rest));
-        if (std::fflush(stdout) != 0 || std::ferror(stdout)) fail("console.write", "cannot write the results to stdout: is the disk full?");
+        if (std::fflush(stdout) != 0 || std::ferror(stdout))
+            fail("console.write", "cannot write the results to stdout: is the disk full?");
         return 0;
     }
-    fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(), nearest_name(words[0], names).c_str());
+    fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(),
+         nearest_name(words[0], names).c_str());
 }
 
 #ifndef WODTEM_NO_MAIN

@@ -83,7 +83,7 @@ struct Method {
 };
 constexpr std::array<const char*, 3> method_names{"dt", "odt", "wodtem"};
 constexpr std::array<Method, 3> methods{{
-    {"DT", Colour::green, "no number (line in fig. 4a)", ""},
+    {"DT", Colour::green, "no number (fig. 4a)", ""},
     {"ODT", Colour::blue, "about 7 (sec. IV-A)", "1d"},
     {"WODTEM", Colour::vermillion, "5 (sec. V-D)", "4b"},
 }};
@@ -473,15 +473,15 @@ inline LineChart mean_chart(const std::vector<Runs>& by_method, Quantity quantit
 }
 
 inline std::string curve_caption(const std::vector<Runs>& by_method) {
+    const bool dt = by_method.at(0)[0]->offline_only();
     return who(by_method) +
-           ". Lines: mean over seeds; bands: one standard deviation to either side, none for a single seed. Dashed: DT, "
-           "which has no online phase (mean over seeds), if there are runs of it. Seeds are evaluated at different "
-           "interactions; drawn every " +
-           std::to_string(curve_step) +
+           ". Lines: mean over seeds; bands: one standard deviation to either side, none for one seed." +
+           (dt ? " DT has no online phase and is the dashed line, its mean over seeds." : "") +
+           " Seeds are evaluated at different interactions; drawn every " + std::to_string(curve_step) +
            " interactions, each seed by its last evaluation until then, and at the last point by its final one." +
            if_unfinished(by_method,
-                         " Unfinished seeds count up to their own last interactions, so that a line may jump "
-                         "where one of them ends.");
+                         " Unfinished seeds count up to their own last interactions, so that a line may jump where one "
+                         "of them ends.");
 }
 
 // Figs. 1b, 4a
@@ -560,7 +560,7 @@ inline void add_grid(Part& part, const Run& run, const std::string& name) {
 }
 
 inline void add_gridworld(Part& part, const std::vector<Runs>& by_method, const std::string& name) {
-    Table summary{{"Method", "Seeds", "Final length", "Final return", "At 5 in the end", "Paper: final length"}, {}};
+    Table summary{{"Method", "Seeds", "Final length", "Final return", "Ends at 5", "Paper: length"}, {}};
     Table seeds{{"Run", "State", "Final length", "Final return", "Shortest met", "At 5 from", "Folder"}, {}};
     std::vector<Runs> online;
     for (const Runs& runs : by_method) {
@@ -584,7 +584,7 @@ inline void add_gridworld(Part& part, const std::vector<Runs>& by_method, const 
                                 runs[0]->about_method().paper_length});
         if (!runs[0]->offline_only()) online.push_back(runs);
     }
-    part.section.tables.insert(part.section.tables.end(), {summary, seeds});
+    part.section.tables = {summary, seeds};
     part.section.paragraphs.push_back(
         "Final: by the last evaluation of a run; lengths in steps. Shortest met: the shortest online episode that "
         "reached the goal. At 5 from: the online interactions of the first evaluation from which on every one took 5 "
@@ -632,7 +632,7 @@ inline void check_seeds(const Runs& runs) {
 
 // The commands that made the runs, one for each unbroken range of seeds.
 inline Table repeat_table(const std::vector<Runs>& by_method) {
-    Table table{{"Runs", "Arithmetic", "Command to repeat them"}, {}};
+    Table table{{"To repeat these runs", "Arithmetic"}, {}};
     for (const Runs& runs : by_method) {
         std::string arithmetic;  // each seed's
         for (const Run* run : runs) {
@@ -642,9 +642,9 @@ inline Table repeat_table(const std::vector<Runs>& by_method) {
         for (const auto& [first, last] : seed_ranges(runs)) {
             const std::string seeds = first < last ? " --seeds " + std::to_string(first) + "-" + std::to_string(last)
                                                    : " --seed " + std::to_string(first);
-            table.rows.push_back({who(runs), arithmetic,
-                                  "wodtem train " + runs[0]->task + " --method " + method_names[runs[0]->method] +
-                                      " --preset " + runs[0]->preset + seeds + other_options(*runs[0])});
+            table.rows.push_back({"wodtem train " + runs[0]->task + " --method " + method_names[runs[0]->method] +
+                                      " --preset " + runs[0]->preset + seeds + other_options(*runs[0]),
+                                  arithmetic});
         }
     }
     return table;
@@ -661,8 +661,8 @@ inline Part make_part(const Runs& runs) {
     const std::string &task = runs.at(0)->task, &preset = runs[0]->preset;
     Part part;
     part.section.heading = task + ", preset " + preset;
-    part.section.tables.push_back(repeat_table(by_method));
     (task == "gridworld" ? add_gridworld : add_other_task)(part, by_method, task + "-" + preset);
+    part.section.tables.push_back(repeat_table(by_method));
     return part;
 }
 
@@ -681,7 +681,7 @@ inline std::string markdown_page(const std::string& title, const std::vector<Par
 inline const char* how_to_read =
     "One section for each task and preset. All numbers come from the run folders, except those in the column marked as "
     "the paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). A run that has not "
-    "finished is marked so and counts with its latest evaluation. Each section begins with the commands that repeat its "
+    "finished is marked so and counts with its latest evaluation. The last table has the commands that repeat the "
     "runs; the file settings in a run's folder has the value of every setting and where it came from.";
 
 }  // namespace results

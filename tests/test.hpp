@@ -1,6 +1,6 @@
 // test.hpp: the whole test runner. A test is a named sentence; a check that does not hold prints where and what.
-//   TEST(lookup_prefers_older_entry_on_tie) { CHECK(...); CHECK_EQUAL(got, expected); CHECK_CLOSE(got, expected, bound); }
-//   CHECK_FAILS("safetensors.truncated", parse(bytes));   // the statement must throw Error with this id
+//   TEST(lookup_prefers_older_entry_on_tie) { CHECK(...); CHECK_EQUAL(got, expected); CHECK_CLOSE(got, expected,
+//   bound); } CHECK_FAILS("safetensors.truncated", parse(bytes));   // the statement must throw Error with this id
 // Random parts draw from test_seed(), which main prints and `build/tests --seed N` gives back.
 #pragma once
 
@@ -49,13 +49,16 @@ std::string shown(const T& value) {
 
 template <class A, class B>
 void check_equal(const char* file, int line, const char* text, const A& got, const B& expected) {
-    if (!(got == expected)) report_failure(file, line, std::string(text) + ": got " + shown(got) + ", expected " + shown(expected));
+    if (!(got == expected))
+        report_failure(file, line, std::string(text) + ": got " + shown(got) + ", expected " + shown(expected));
 }
 
 // |got - expected| <= bound, absolute; NaN never passes.
 inline void check_close(const char* file, int line, const char* text, double got, double expected, double bound) {
     if (!(std::fabs(got - expected) <= bound))
-        report_failure(file, line, std::string(text) + ": got " + shown(got) + ", expected " + shown(expected) + " within " + shown(bound));
+        report_failure(
+            file, line,
+            std::string(text) + ": got " + shown(got) + ", expected " + shown(expected) + " within " + shown(bound));
 }
 
 inline void check_fails(const char* file, int line, const std::string& id, const std::function<void()>& statement) {
@@ -63,16 +66,19 @@ inline void check_fails(const char* file, int line, const std::string& id, const
         statement();
         report_failure(file, line, "expected the error " + id + ", nothing was thrown");
     } catch (const Error& error) {
-        if (error.id != id) report_failure(file, line, "expected the error " + id + ", got " + error.id + ": " + error.what());
+        if (error.id != id)
+            report_failure(file, line, "expected the error " + id + ", got " + error.id + ": " + error.what());
     }
 }
 
-#define TEST(name)                                                              \
-    static void name();                                                         \
-    static const bool name##_added = add_test({#name, __FILE__, name});         \
+#define TEST(name)                                                      \
+    static void name();                                                 \
+    static const bool name##_added = add_test({#name, __FILE__, name}); \
     static void name()
-#define CHECK(condition) \
-    do { if (!(condition)) report_failure(__FILE__, __LINE__, "does not hold: " #condition); } while (false)
+#define CHECK(condition)                                                                    \
+    do {                                                                                    \
+        if (!(condition)) report_failure(__FILE__, __LINE__, "does not hold: " #condition); \
+    } while (false)
 #define CHECK_EQUAL(got, expected) check_equal(__FILE__, __LINE__, #got, got, expected)
 #define CHECK_CLOSE(got, expected, bound) check_close(__FILE__, __LINE__, #got, got, expected, bound)
 #define CHECK_FAILS(id, ...) check_fails(__FILE__, __LINE__, id, [&] { __VA_ARGS__; })

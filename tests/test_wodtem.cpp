@@ -1,0 +1,694 @@
+// test_wodtem.cpp: the method and the command line: the objective against its equations written out, the phases against
+// the paper's sentences, runs against themselves (threads, kills, alpha = 1), bad input against its sentence.
+#include <sys/resource.h>
+#include <sys/wait.h>
+
+#include <fstream>
+
+#define WODTEM_NO_MAIN
+#include "../wodtem.cpp"
+#include "test.hpp"
+
+namespace {
+
+// A fresh folder that goes away with the test.
+struct Scratch {
+    std::string path;
+    Scratch() {
+        char name[] = "/tmp/wodtem-test-XXXXXX";
+        path = mkdtemp(name);
+    }
+    ~Scratch() { fs::remove_all(path); }
+    std::string operator/(const std::string& name) const { return path + "/" + name; }
+};
+
+// A run that takes a fraction of a second.
+Settings tiny_settings(const std::string& method, const std::string& alpha = "0.75") {
+    Settings settings = default_settings("gridworld", method, "small");
+    for (auto [name, value] : std::initializer_list<std::pair<const char*, const char*>>{{"width", "8"},
+                                                                                         {"batch_size", "32"},
+                                                                                         {"offline_updates", "40"},
+                                                                                         {"updates_per_iteration", "5"},
+                                                                                         {"eval_every", "3"},
+                                                                                         {"learning_rate", "0.01"},
+                                                                                         {"warmup_updates", "10"},
+                                                                                         {"data_trajectories", "60"},
+                                                                                         {"buffer_size", "20"}})
+        set_setting(settings, name, value);
+    if (method != "dt") set_setting(settings, "online_steps", "400");
+    set_setting(settings, "alpha", alpha);
+    settings.arithmetic = choose_kernel("auto").fused ? "fused" : "plain";
+    return settings;
+}
+
+void quiet_train(const Settings& settings, const std::string& folder, int threads = 1, double checkpoint_every = 1e9) {
+    const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
+    std::fflush(stdout);
+    dup2(null, 1), dup2(null, 2);
+    TrainOptions options;
+    options.threads = threads;
+    options.checkpoint_every = checkpoint_every;
+    std::exception_ptr problem;
+    try {
+        train(settings, folder, options);
+    } catch (...) {
+        problem = std::current_exception();
+    }
+    std::fflush(stdout);
+    dup2(out, 1), dup2(err, 2);
+    close(out), close(err), close(null);
+    if (problem) std::rethrow_exception(problem);
+}
+
+const char* const result_files[] = {"progress.csv", "episodes.csv", "model.safetensors", "policy.csv",
+                                    "start_actions.csv"};
+
+void check_same_results(const std::string& a, const std::string& b) {
+    for (const char* name : result_files) {
+        if (read_file(a + "/" + name) != read_file(b + "/" + name))
+            report_failure(__FILE__, __LINE__, a + " and " + b + " differ in " + name);
+    }
+}
+
+// A run ready for its first update, and what it stands on.
+struct Fixture {
+    Compute compute;
+    Run run;
+    explicit Fixture(const Settings& settings)
+        : compute(choose_kernel("auto"), 1),
+          run(compute, settings, make_environment(settings).spec()) {
+        begin_run(run, make_data_set(settings, make_environment(settings)));
+    }
+};
+
+// A batch for the Gaussian and the categorical head alike: two windows of 1 and 3 steps.
+Batch painted_batch(int state_dim, int action_dim, int moves) {
+    Batch batch;
+    batch.sequences.lengths = {1, 3};
+    const auto paint = [](int i) { return static_cast<float>((i * 37) % 251 - 125) / 128.0f; };
+    for (int i = 0; i < 4; ++i) {
+        batch.sequences.returns_to_go.push_back(paint(i + 11));
+        batch.sequences.timesteps.push_back(i);
+        batch.mean.push_back(i == 0 ? 0.5f : 0.5f / 3);
+        batch.weights.push_back(i % 2 == 0 ? 1.0f : 0.75f);
+    }
+    for (int i = 0; i < 4 * state_dim; ++i) batch.sequences.states.push_back(paint(i));
+    for (int i = 0; i < 4 * (moves > 0 ? moves : action_dim); ++i) batch.sequences.actions.push_back(paint(i + 50));
+    for (int i = 0; i < 4 * action_dim; ++i) {
+        batch.actions.push_back(moves > 0 ? static_cast<float>(i % moves) : paint(i + 90));
+        batch.remembered.push_back(moves > 0 ? static_cast<float>((3 * i + 1) % moves) : paint(i + 130));
+    }
+    return batch;
+}
+
+TransformerConfig tiny_config(Head head, int state_dim, int action_dim) {
+    return {state_dim, action_dim, 2, 2, 8, 6, 0.1f, head};
+}
+
+}  // namespace
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Settings
+
+// WODTEM Table I test
+TEST(the_paper_preset_is_table_one) {
+    const Settings s = default_settings("gridworld", "wodtem", "paper");
+    const std::map<std::string, std::string> table = {{"layers", "1"},
+                                                      {"heads", "1"},
+                                                      {"width", "512"},
+                                                      {"context_length", "1"},
+                                                      {"weight_decay", "0"},
+                                                      {"learning_rate", "0.001"},
+                                                      {"offline_updates", "1000"},
+                                                      {"updates_per_iteration", "50"},
+                                                      {"buffer_size", "500"},
+                                                      {"position", "no"},
+                                                      {"g_online", "2"},
+                                                      {"g_eval", "1"},
+                                                      // sec. V-D
+                                                      {"projected_dim", "0"},
+                                                      {"table_size", "36"},
+                                                      {"gamma", "0.99"},
+                                                      {"K", "1"},
+                                                      {"epsilon", "0.1"},
+                                                      {"alpha", "0.75"},
+                                                      {"online_steps", "20000"},
+                                                      // ODT's code
+                                                      {"batch_size", "256"},
+                                                      {"dropout", "0.1"},
+                                                      {"warmup_updates", "10000"},
+                                                      {"clip_norm", "0.25"},
+                                                      {"initial_lambda", "0.1"},
+                                                      {"lambda_learning_rate", "1e-04"},
+                                                      {"optimizer", "lamb"},
+                                                      {"eval_every", "10"}};
+    for (const auto& [name, value] : table)
+        CHECK_EQUAL(name + " = " + setting_text(s, setting_row(name)), name + " = " + value);
+}
+
+TEST(the_small_preset_differs_in_width_alone) {
+    const Settings paper = default_settings("gridworld", "odt", "paper"),
+                   small = default_settings("gridworld", "odt", "small");
+    for (const SettingRow& row : setting_rows) {
+        const std::string name = row.name;
+        if (name != "preset" && name != "width") CHECK_EQUAL(setting_text(small, row), setting_text(paper, row));
+    }
+    CHECK(small.width < paper.width);
+}
+
+TEST(settings_survive_being_written_and_read) {
+    Settings s = tiny_settings("wodtem");
+    set_setting(s, "epsilon", "0.30000000000000004");
+    const std::string text = settings_text(s);
+    CHECK_EQUAL(settings_text(settings_from_text(text, "memory")), text);
+    for (const SettingRow& row : setting_rows) CHECK(std::string(row.source).size() > 3);
+}
+
+TEST(bad_settings_are_usage_errors_that_name_the_nearest) {
+    Settings s;
+    CHECK_FAILS("usage.setting", set_setting(s, "alhpa", "1"));
+    CHECK_FAILS("usage.setting", set_setting(s, "alpha", "1.5"));
+    CHECK_FAILS("usage.setting", set_setting(s, "alpha", "nan"));
+    CHECK_FAILS("usage.setting", set_setting(s, "K", "1.5"));
+    CHECK_FAILS("usage.setting", set_setting(s, "K", ""));
+    CHECK_FAILS("usage.setting", set_setting(s, "eviction", "lfru"));
+    CHECK_FAILS("usage.setting", set_setting(s, "position", "maybe"));
+    try {
+        set_setting(s, "epsilom", "1");
+    } catch (const Error& error) {
+        CHECK(std::string(error.what()).find("\"epsilon\"") != std::string::npos);
+    }
+    try {
+        set_setting(s, "alpha", "1.5");
+    } catch (const Error& error) {
+        CHECK(std::string(error.what()).find("nearest is 1") != std::string::npos);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Objective
+
+// WODTEM eq. (1) test, WODTEM eq. (2) test, WODTEM eq. (3) test, WODTEM eq. (8) test, WODTEM eq. (9) test,
+// WODTEM eq. (10) test: categorical policy, all sums written out in double.
+TEST(objective_is_the_equations_written_out) {
+    Compute compute(choose_kernel("auto"), 1);
+    Tape<double> tape(compute);
+    const Transformer<double> model(tiny_config(Head::categorical, 3, 5), test_seed());
+    const Batch batch = painted_batch(3, 1, 5);
+    tape.recording = true;
+    tape.dropout_random.seed = test_seed();
+    const Policy<double> policy = forward(tape, model, batch.sequences, Ask::every_state);
+    const float lambda = 0.3f;
+    const Objective<double> got = objective(tape, Head::categorical, policy, batch, nullptr, lambda, true);
+
+    double L = 0, J = 0, H = 0;
+    const int first_step[] = {0, 1}, steps[] = {1, 3};
+    for (int window = 0; window < 2; ++window) {
+        double l = 0, j = 0, h = 0;
+        for (int c = first_step[window]; c < first_step[window] + steps[window]; ++c) {
+            const size_t at = static_cast<size_t>(c);
+            const double* log_p = policy.mean.value + c * 5;
+            const double w = batch.weights[at], a = log_p[static_cast<int>(batch.actions[at])],
+                         a_hat = log_p[static_cast<int>(batch.remembered[at])];
+            l -= w * a + (1 - w) * a_hat;
+            j -= a;
+            for (int move = 0; move < 5; ++move) h -= std::exp(log_p[move]) * log_p[move];
+        }
+        L += l / steps[window] / 2, J += j / steps[window] / 2, H += h / steps[window] / 2;
+    }
+    CHECK_CLOSE(got.likelihood.value[0], L, 1e-6);  // the coefficients 1 / (B |C^t|) are float32
+    CHECK_CLOSE(got.entropy.value[0], H, 1e-6);
+    CHECK_CLOSE(got.loss.value[0], L - static_cast<double>(lambda) * H, 1e-6);
+    CHECK(std::fabs(L - J) > 1e-3);  // the memory's part is there
+
+    Batch plain = batch;
+    plain.weights.assign(4, 1.0f);
+    CHECK_CLOSE(objective(tape, Head::categorical, policy, plain, nullptr, lambda, true).likelihood.value[0], J, 1e-6);
+}
+
+// The whole objective, network included, against central differences, for every head and every parameter.
+TEST(objective_gradient_equals_central_differences) {
+    Compute compute(choose_kernel("auto"), 1);
+    for (const Head head : {Head::categorical, Head::squashed_gaussian, Head::deterministic}) {
+        const int moves = head == Head::categorical ? 5 : 0, action_dim = moves > 0 ? 1 : 3;
+        Transformer<double> model(tiny_config(head, 3, moves > 0 ? 5 : 3), test_seed());
+        const Batch batch = painted_batch(3, action_dim, moves);
+        const std::vector<float> noise = {0.3f, -1.2f, 0.7f, 0.1f, -0.4f, 2.0f, -0.9f, 0.5f, 1.1f, -0.2f, 0.6f, -1.5f};
+        Tape<double> tape(compute);
+        tape.dropout_random.seed = test_seed();
+        const auto loss = [&] {
+            tape.reset();
+            const Policy<double> policy = forward(tape, model, batch.sequences, Ask::every_state);
+            return objective(tape, head, policy, batch, noise.data(), 0.3f, head != Head::deterministic).loss;
+        };
+        tape.backward(loss());
+        double worst = 0, largest = 0;
+        for (Parameter<double>& parameter : model.parameters) {
+            double scale = 1e-3;
+            for (const double g : parameter.gradient) scale = std::max(scale, std::fabs(g));
+            largest = std::max(largest, scale);
+            for (size_t i = 0; i < parameter.value.size(); i += 1 + parameter.value.size() / 16) {
+                const double kept = parameter.value[i], h = 1e-5;
+                parameter.value[i] = kept + h;
+                const double above = loss().value[0];
+                parameter.value[i] = kept - h;
+                const double below = loss().value[0];
+                parameter.value[i] = kept;
+                worst = std::max(worst, std::fabs((above - below) / (2 * h) - parameter.gradient[i]) / scale);
+            }
+        }
+        CHECK(largest > 1e-2);
+        CHECK_CLOSE(worst, 0, 1e-6);
+    }
+}
+
+// WODTEM eq. (1) test, WODTEM eq. (8) test: the player of lambda. Adam's first step has the size of its learning rate.
+TEST(lambda_falls_when_the_entropy_is_above_eta_and_rises_below) {
+    Settings settings = tiny_settings("odt");
+    set_setting(settings, "eta", "1.5");
+    for (const double entropy : {1.9, 1.1}) {
+        Fixture f(settings);
+        const double before = f.run.temperature.log_lambda[0].value[0];
+        update_lambda(f.run, f.compute, entropy);
+        CHECK_CLOSE(f.run.temperature.log_lambda[0].value[0] - before, entropy > 1.5 ? -1e-4 : 1e-4, 1e-6);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Batches and the memory's advice
+
+TEST(batches_hold_what_the_buffer_holds) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "context_length", "4");
+    Fixture f(settings);
+    const Batch batch = sample_batch(f.run);
+    double sum = 0;
+    size_t step = 0;
+    for (uint32_t window = 0; window < 32; ++window) {
+        const Window at = f.run.replay.sample(f.run.random(Stream::batch), 0, window, 4);
+        const Trajectory& trajectory = f.run.replay.trajectories[at.trajectory];
+        CHECK_EQUAL(batch.sequences.lengths[window], std::min(4, trajectory.length() - at.start));
+        for (int c = 0; c < at.length; ++c, ++step) {
+            const size_t t = static_cast<size_t>(at.start + c);
+            CHECK_EQUAL(batch.actions[step], trajectory.actions[t]);
+            CHECK_EQUAL(batch.sequences.actions[step * 8 + static_cast<size_t>(trajectory.actions[t])], 1.0f);
+            CHECK_EQUAL(batch.sequences.returns_to_go[step],
+                        static_cast<float>(trajectory.terminated ? 1 : 0));  // reward 1 comes last
+            const double d = trajectory.terminated ? std::pow(0.99, trajectory.length() - 1 - static_cast<int>(t)) : 0;
+            CHECK_CLOSE(batch.discounted_returns[step], d, 1e-12);
+            sum += static_cast<double>(batch.mean[step]);
+        }
+    }
+    CHECK_CLOSE(sum, 1, 1e-6);
+}
+
+TEST(normalised_states_have_mean_zero_and_deviation_one) {
+    Fixture f(tiny_settings("odt"));
+    double count = 0, sum[2] = {}, squares[2] = {};
+    for (const Trajectory& trajectory : make_data_set(f.run.agent.settings, GridWorld{})) {
+        std::vector<float> x;
+        for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t)
+            append_normalised(x, f.run.agent.normaliser, &trajectory.states[2 * t]);
+        for (size_t i = 0; i < x.size(); ++i)
+            sum[i % 2] += static_cast<double>(x[i]),
+                squares[i % 2] += static_cast<double>(x[i]) * static_cast<double>(x[i]);
+        count += trajectory.length();
+    }
+    for (const int i : {0, 1}) CHECK_CLOSE(sum[i] / count, 0, 1e-4), CHECK_CLOSE(squares[i] / count, 1, 1e-4);
+}
+
+// In the grid world epsilon 0.1 admits the very cell alone: the advice must be the best move ever made there.
+TEST(advice_is_the_best_move_ever_made_in_the_cell) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "batch_size", "512");
+    Fixture f(settings);
+    std::map<std::pair<float, float>, std::pair<double, float>> best;  // cell -> (d, a), first to reach it
+    for (const Trajectory& trajectory : offline_set(make_data_set(f.run.agent.settings, GridWorld{}), false))
+        for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t) {
+            const std::pair<float, float> cell = {trajectory.states[2 * t], trajectory.states[2 * t + 1]};
+            const auto found = best.find(cell);
+            if (found == best.end() || trajectory.discounted_returns[t] > found->second.first)
+                best[cell] = {trajectory.discounted_returns[t], trajectory.actions[t]};
+        }
+    CHECK_EQUAL(f.run.memory.size(), best.size());
+    Batch batch = sample_batch(f.run);
+    consult_memory(f.run, batch);
+    double short_pairs = 0;
+    for (size_t i = 0; i < batch.weights.size(); ++i) {
+        const auto [d, a] = best.at({batch.raw_states[i][0], batch.raw_states[i][1]});
+        const bool falls_short = batch.discounted_returns[i] < d;
+        CHECK_EQUAL(batch.weights[i], falls_short ? 0.75f : 1.0f);
+        if (falls_short) CHECK_EQUAL(batch.remembered[i], a);
+        short_pairs += falls_short;
+    }
+    CHECK_EQUAL(f.run.progress.short_pairs, short_pairs);
+    CHECK(short_pairs > 0 && short_pairs < 512);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Acting
+
+TEST(episodes_side_by_side_are_the_episodes_one_by_one) {
+    Settings settings = tiny_settings("odt");
+    set_setting(settings, "context_length", "3");
+    set_setting(settings, "eval_context", "3");
+    Fixture f(settings);
+    const std::vector<Trajectory> together = rollout(f.run, GridWorld{}, Act::sample, 2, 5, 4);
+    for (uint64_t i = 0; i < 4; ++i) {
+        const std::vector<Trajectory> alone = rollout(f.run, GridWorld{}, Act::sample, 2, 5 + i, 1);
+        CHECK(alone[0].actions == together[i].actions && alone[0].states == together[i].states);
+    }
+    CHECK(together[0].actions != together[1].actions);
+}
+
+TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_most_likely) {
+    Fixture f(tiny_settings("odt"));
+    float log_p[8];
+    const double p[8] = {0.3, 0.05, 0.05, 0.3, 0.1, 0.1, 0.05, 0.05};
+    for (int i = 0; i < 8; ++i) log_p[i] = static_cast<float>(std::log(p[i]));
+    const Policy<float> policy = {{log_p, nullptr, 1, 8}, {}};
+    const Random random = {test_seed(), Stream::exploration};
+    CHECK_EQUAL(choose_action(f.run.agent, policy, 0, Act::most_likely, random, 0, 0)[0], 0.0f);
+    double counts[8] = {}, chi_square = 0;
+    const int n = 20000;
+    for (uint32_t t = 0; t < n; ++t)
+        counts[static_cast<int>(choose_action(f.run.agent, policy, 0, Act::sample, random, 1, t)[0])] += 1;
+    for (int i = 0; i < 8; ++i) chi_square += (counts[i] - n * p[i]) * (counts[i] - n * p[i]) / (n * p[i]);
+    CHECK(chi_square < 29.9);  // 7 degrees of freedom: exceeded once in 10,000 seeds
+}
+
+// WODTEM sec. III-B test: the agent is told the target less what it received; the buffer gets hindsight returns.
+TEST(acting_is_told_the_target_less_the_rewards_so_far) {
+    Settings settings = tiny_settings("odt");
+    set_setting(settings, "context_length", "2");
+    set_setting(settings, "eval_context", "2");
+    Fixture f(settings);
+    std::vector<Episode> episodes(2);
+    episodes[0].state = {1, 2};
+    episodes[0].returns_to_go = {2};
+    episodes[1].state = {4, 5};
+    episodes[1].returns_to_go = {2, 2, 1.5f};
+    episodes[1].trajectory.states = {0, 0, 3, 3};
+    episodes[1].trajectory.actions = {4, 1};
+    episodes[1].trajectory.rewards = {0, 0.5f};
+    const SequenceBatch batch = acting_batch(f.run.agent, episodes);
+    CHECK(batch.lengths == (std::vector<int>{1, 2}));
+    CHECK(batch.returns_to_go == (std::vector<float>{2, 2, 1.5f}));
+    CHECK(batch.timesteps == (std::vector<int>{0, 1, 2}));
+    std::vector<float> expected;
+    for (const auto& state : {std::array{1.0f, 2.0f}, std::array{3.0f, 3.0f}, std::array{4.0f, 5.0f}})
+        append_normalised(expected, f.run.agent.normaliser, state.data());
+    CHECK(batch.states == expected);
+    CHECK_EQUAL(batch.actions[8 + 1], 1.0f);  // the second window's first step made move 1
+    const Trajectory played = rollout(f.run, GridWorld{}, Act::sample, 2, 0, 1)[0];
+    CHECK_EQUAL(played.returns_to_go[0], played.terminated ? 1.0 : 0.0);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Runs
+
+TEST(results_do_not_depend_on_the_number_of_threads) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("wodtem"), scratch / "1");
+    for (int threads = 2; threads <= 8; ++threads) {
+        quiet_train(tiny_settings("wodtem"), scratch / std::to_string(threads), threads);
+        check_same_results(scratch / "1", scratch / std::to_string(threads));
+    }
+}
+
+// WODTEM sec. IV-B.3 test: "when alpha = 1, our method degenerates to ODT"
+TEST(wodtem_with_alpha_one_is_odt_bit_for_bit) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("odt"), scratch / "odt");
+    quiet_train(tiny_settings("wodtem", "1"), scratch / "one");
+    quiet_train(tiny_settings("wodtem", "0.75"), scratch / "wodtem");
+    for (const char* name : {"episodes.csv", "policy.csv", "start_actions.csv"}) {
+        CHECK(read_file(scratch / "odt/" + name) == read_file(scratch / "one/" + name));
+        CHECK(read_file(scratch / "odt/" + name) != read_file(scratch / "wodtem/" + name));
+    }
+    const TensorFile odt = read_safetensors(scratch / "odt/model.safetensors"),
+                     one = read_safetensors(scratch / "one/model.safetensors");
+    CHECK(odt.buffer.substr(odt.data_start) == one.buffer.substr(one.data_start));
+}
+
+// Kills a run again and again, at any moment, with a checkpoint after each update; it must end as if nothing had been.
+TEST(a_run_killed_at_any_moment_ends_with_the_same_bytes) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("wodtem"), scratch / "whole");
+    const Random random = {test_seed(), Stream::data_set};
+    int kills = 0;
+    for (uint32_t attempt = 0; !fs::exists(scratch / "killed/finished") && attempt < 400; ++attempt) {
+        const pid_t child = fork();
+        if (child == 0) {
+            quiet_train(tiny_settings("wodtem"), scratch / "killed", 1 + static_cast<int>(attempt % 2), 0);
+            _exit(0);
+        }
+        usleep(static_cast<useconds_t>(2000 + 80000 * random.uniform(0, attempt)));
+        kill(child, SIGKILL);
+        int status = 0;
+        waitpid(child, &status, 0);
+        kills += WIFSIGNALED(status);
+    }
+    CHECK(kills >= 3);
+    CHECK(fs::exists(scratch / "killed/finished"));
+    check_same_results(scratch / "whole", scratch / "killed");
+    CHECK(!fs::exists(scratch / "killed/checkpoint.safetensors"));
+}
+
+TEST(a_request_to_stop_saves_and_the_same_command_continues) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("odt"), scratch / "whole");
+    stop_requested = 1;
+    CHECK_FAILS("run.stopped", quiet_train(tiny_settings("odt"), scratch / "stopped"));
+    stop_requested = 0;
+    CHECK(fs::exists(scratch / "stopped/checkpoint.safetensors"));
+    quiet_train(tiny_settings("odt"), scratch / "stopped");
+    check_same_results(scratch / "whole", scratch / "stopped");
+}
+
+TEST(evaluation_needs_the_model_file_alone) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("wodtem"), scratch / "run");
+    const Table progress = parse_csv(read_file(scratch / "run/progress.csv"), "progress.csv");
+    fs::rename(scratch / "run/model.safetensors", scratch / "model.safetensors");
+    fs::remove_all(scratch / "run");
+    Arguments arguments;
+    arguments.options = {{"--kernel", "auto"}, {"--threads", "1"}};
+    LoadedModel model = open_model(scratch / "model.safetensors", arguments);
+    const Evaluation evaluation = evaluate(*model.run, model.environment, 0, 2);
+    CHECK_EQUAL(number_text(evaluation.mean_length), progress.rows.back()[12]);
+    CHECK_EQUAL(number_text(evaluation.mean_return), progress.rows.back()[13]);
+}
+
+TEST(progress_rows_keep_to_the_schedule) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("wodtem"), scratch / "run");
+    const Table progress = parse_csv(read_file(scratch / "run/progress.csv"), "progress.csv");
+    const Table episodes = parse_csv(read_file(scratch / "run/episodes.csv"), "episodes.csv");
+    CHECK_EQUAL(progress.rows[0][0], "offline");
+    CHECK_EQUAL(progress.rows[0][1], "40");
+    size_t interactions = 0;
+    for (size_t i = 0; i < episodes.rows.size(); ++i) {
+        interactions += std::stoul(episodes.rows[i][2]);
+        CHECK_EQUAL(episodes.rows[i][1], std::to_string(interactions));
+        CHECK_EQUAL(episodes.rows[i][5].size(), std::stoul(episodes.rows[i][2]));
+    }
+    CHECK(interactions >= 400 && interactions < 500);
+    for (size_t i = 1; i < progress.rows.size(); ++i) {
+        const size_t number = std::stoul(progress.rows[i][3]);
+        if (i + 1 < progress.rows.size()) CHECK_EQUAL(number, 3 * i);
+        CHECK_EQUAL(progress.rows[i][1], std::to_string(40 + 5 * number));  // every episode is followed by its updates
+        CHECK_EQUAL(progress.rows[i][2], episodes.rows[number - 1][1]);
+    }
+    CHECK_EQUAL(progress.rows.back()[3], std::to_string(episodes.rows.size()));
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Things that go wrong
+
+TEST(a_folder_of_other_settings_is_left_alone) {
+    const Scratch scratch;
+    quiet_train(tiny_settings("odt"), scratch / "run");
+    const std::string before = read_file(scratch / "run/model.safetensors");
+    CHECK_FAILS("run.other_settings", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    Settings other = tiny_settings("odt");
+    set_setting(other, "g_online", "3");
+    CHECK_FAILS("run.other_settings", quiet_train(other, scratch / "run"));
+    CHECK(read_file(scratch / "run/model.safetensors") == before);
+    quiet_train(tiny_settings("odt"), scratch / "run");  // finished already
+    CHECK(read_file(scratch / "run/model.safetensors") == before);
+}
+
+TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
+    const Scratch scratch;
+    stop_requested = 1;
+    CHECK_FAILS("run.stopped", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    stop_requested = 0;
+    const std::string path = scratch / "run/checkpoint.safetensors", good = read_file(path);
+    for (const size_t size : {size_t{0}, size_t{7}, size_t{100}, good.size() / 2, good.size() - 1}) {
+        write_file_atomic(path, std::string_view(good).substr(0, size));
+        CHECK_FAILS("safetensors.truncated", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    }
+    std::string flipped = good;
+    flipped[good.size() - 50] = static_cast<char>(flipped[good.size() - 50] ^ 4);
+    write_file_atomic(path, flipped);
+    CHECK_FAILS("safetensors.checksum", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    CHECK(read_file(path) == flipped);
+
+    TensorFile file = parse_safetensors(good, path);  // well-formed, but of another network
+    TensorFile other;
+    other.metadata = file.metadata;
+    for (const StoredTensor& tensor : file.tensors) {
+        if (tensor.dtype == DType::F32) {
+            std::vector<float> values = file.get<float>(tensor.name, tensor.shape);
+            if (tensor.name == "model.value.embed_ln.weight") values.pop_back();
+            other.add(tensor.name, tensor.shape.empty() ? Shape{} : Shape{values.size()}, values);
+        } else if (tensor.dtype == DType::U64) {
+            other.add(tensor.name, tensor.shape, file.get<uint64_t>(tensor.name, tensor.shape));
+        } else if (tensor.dtype == DType::U32) {
+            other.add(tensor.name, tensor.shape, file.get<uint32_t>(tensor.name, tensor.shape));
+        } else {
+            other.add(tensor.name, tensor.shape, file.get<double>(tensor.name, tensor.shape));
+        }
+    }
+    write_safetensors(path, other);
+    CHECK_FAILS("checkpoint.shape", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+
+    write_file_atomic(path, good);
+    truncate_file(scratch / "run/episodes.csv", 3);
+    CHECK_FAILS("file.shorter", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    write_file_atomic(scratch / "run/settings", "width = 8 # half a file");
+    CHECK_FAILS("run.other_settings", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+}
+
+TEST(damaged_models_are_refused) {
+    const Scratch scratch;
+    Fixture f(tiny_settings("odt"));
+    save_model(f.run, scratch / "model.safetensors");
+    Arguments arguments;
+    arguments.options = {{"--kernel", "auto"}, {"--threads", "1"}};
+    open_model(scratch / "model.safetensors", arguments);
+    f.run.agent.model.parameters[3].value[0] = NAN;
+    save_model(f.run, scratch / "nan.safetensors");
+    CHECK_FAILS("model.not_finite", open_model(scratch / "nan.safetensors", arguments));
+    save_checkpoint(f.run, {scratch.path});
+    CHECK_FAILS("model.format", open_model(scratch / "checkpoint.safetensors", arguments));
+    CHECK_FAILS("file.open", open_model(scratch / "none.safetensors", arguments));
+}
+
+TEST(an_impossible_folder_or_a_full_disk_is_a_sentence) {
+    const Scratch scratch;
+    write_file_atomic(scratch / "file", "x");
+    CHECK_FAILS("run.folder", quiet_train(tiny_settings("odt"), scratch / "file/run"));
+    // A limit on file sizes stands in for a full disk: the checkpoint does not fit, the logs do.
+    const pid_t child = fork();
+    if (child == 0) {
+        std::signal(SIGXFSZ, SIG_IGN);
+        const rlimit limit = {8192, 8192};
+        setrlimit(RLIMIT_FSIZE, &limit);
+        try {
+            quiet_train(tiny_settings("wodtem"), scratch / "full", 1, 0);
+        } catch (const Error& error) {
+            _exit(error.id == "file.write" &&
+                          std::string(error.what()).find("checkpoint.safetensors") != std::string::npos
+                      ? 42
+                      : 1);
+        }
+        _exit(0);
+    }
+    int status = 0;
+    waitpid(child, &status, 0);
+    CHECK_EQUAL(WEXITSTATUS(status), 42);
+    CHECK(!fs::exists(scratch / "full/checkpoint.safetensors.tmp"));
+    quiet_train(tiny_settings("wodtem"), scratch / "full");
+    CHECK(fs::exists(scratch / "full/finished"));
+}
+
+TEST(numbers_that_are_not_finite_stop_the_run_and_name_the_tensor) {
+    const Scratch scratch;
+    Fixture f(tiny_settings("odt"));
+    Session<GridWorld> session{GridWorld{}, {scratch.path}, {}, 1e9};
+    f.run.agent.model.parameters.back().value[2] = INFINITY;  // a logit's bias
+    CHECK_FAILS("nn.not_finite", update_and_watch(f.run, session));
+    Fixture g(tiny_settings("odt"));
+    g.run.agent.model.parameters[0].gradient[1] = NAN;
+    try {
+        update_and_watch(g.run, session);
+        CHECK(false);
+    } catch (const Error& error) {
+        const std::string sentence = error.what();
+        CHECK(sentence.find("embed_return.weight") != std::string::npos &&
+              sentence.find("update 1 ") != std::string::npos);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The command line, through the program itself
+
+namespace {
+struct Outcome {
+    int status;
+    std::string text;
+};
+Outcome shell(const std::string& command) {
+    FILE* pipe = popen((command + " 2>&1").c_str(), "r");
+    Outcome outcome = {0, ""};
+    for (int c; (c = std::fgetc(pipe)) != EOF;) outcome.text += static_cast<char>(c);
+    outcome.status = WEXITSTATUS(pclose(pipe));
+    return outcome;
+}
+void check_shell(const std::string& command, int status, const std::string& part) {
+    const Outcome outcome = shell(command);
+    if (outcome.status != status || outcome.text.find(part) == std::string::npos)
+        report_failure(__FILE__, __LINE__,
+                       command + ": status " + std::to_string(outcome.status) + ", said: " + outcome.text);
+}
+}  // namespace
+
+TEST(bad_usage_exits_with_two_and_names_the_nearest) {
+    check_shell("./wodtem", 2, "wodtem COMMAND --help");
+    check_shell("./wodtem --help", 0, "report");
+    check_shell("./wodtem train --help", 0, "updates_per_iteration");
+    check_shell("./wodtem trian gridworld", 2, "nearest is train");
+    check_shell("./wodtem train gridwrold", 2, "nearest is \"gridworld\"");
+    check_shell("./wodtem train gridworld --metod odt", 2, "nearest is --method");
+    check_shell("./wodtem train gridworld --method odd", 2, "nearest is \"odt\"");
+    check_shell("./wodtem train gridworld --seed -1", 2, "nearest is 0");
+    check_shell("./wodtem train gridworld --seed 1 --seed 2", 2, "given twice");
+    check_shell("./wodtem train gridworld --seed", 2, "needs a value");
+    check_shell("./wodtem train gridworld --set alpha=2", 2, "nearest is 1");
+    check_shell("./wodtem train gridworld --set alhpa=1", 2, "nearest is \"alpha\"");
+    check_shell("./wodtem train gridworld --set alpha", 2, "NAME=VALUE");
+    check_shell("./wodtem train gridworld --set width=15 --set heads=2", 2, "nearest width is 16");
+    check_shell("./wodtem train gridworld --kernel sse9", 2, "portable");
+    check_shell("./wodtem train gridworld --threads 1000", 2, "nearest is 256");
+    check_shell("./wodtem train", 2, "TASK");
+    check_shell("./wodtem sweep --seeds 4-0", 2, "range");
+}
+
+TEST(failures_exit_with_one_and_a_sentence) {
+    const Scratch scratch;
+    check_shell("./wodtem eval " + (scratch / "none"), 1, scratch / "none");
+    write_file_atomic(scratch / "text", "not a model at all");
+    check_shell("./wodtem info " + (scratch / "text"), 1, "text");
+    check_shell("./wodtem report " + (scratch / "none") + " --out " + (scratch / "out"), 1, "none");
+    check_shell("./wodtem train gridworld --out /proc/none", 1, "/proc/none");
+    check_shell("(./wodtem tasks > /dev/full)", 1, "stdout");
+    check_shell("./wodtem tasks", 0, "gridworld");
+    check_shell("./wodtem sweep --seeds 0-1 --methods odt,wodtem", 0,
+                "train gridworld --method wodtem --preset small --seed 1");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The map from the paper to the code: each equation has code and a test, under one greppable form.
+
+TEST(every_equation_is_tagged_in_the_code_and_in_a_test) {
+    const auto text_of = [](const char* pattern) { return shell(std::string("cat ") + pattern).text; };
+    const std::string code = text_of("nn.hpp memory.hpp gridworld.hpp wodtem.cpp"), tests = text_of("tests/*.cpp");
+    for (int equation = 1; equation <= 10; ++equation) {
+        const std::string tag = "WODTEM eq. (" + std::to_string(equation) + ")";
+        if (code.find(tag + ":") == std::string::npos && code.find(tag + ",") == std::string::npos)
+            report_failure(__FILE__, __LINE__, "no code for " + tag);
+        if (tests.find(tag + " test") == std::string::npos) report_failure(__FILE__, __LINE__, "no test for " + tag);
+    }
+}
