@@ -612,19 +612,24 @@ struct EpisodicMemory {
         for (const Neighbour& neighbour : found) count_access(neighbour.entry);
     }
 
-    // search(), counted. Rebuilds the tree first when more than recent_limit entries (about a microsecond to scan) are
-    // not in it. Who calls search() directly calls rebuild_index() after updates, once per online iteration, say.
+    // search(), counted, from a fresh enough tree.
     std::vector<Neighbour> neighbours(const float* state) {
-        if (recent.size() > recent_limit) rebuild_index();
+        refresh_index();
         const std::vector<Neighbour> found = search(state);
         count_accesses(found);
         return found;
     }
 
+    // Rebuilds the tree when too many entries are not in it: more than an eighth of it, or recent_limit (about a
+    // microsecond to scan). Who calls search() directly calls this after updates.
+    void refresh_index() {
+        if (recent.size() > std::min(recent_limit, tree.count / 8)) rebuild_index();
+    }
+
     void rebuild_index() {
         if (recent.empty()) return;
         tree.build(projected, age, dim, insertions);
-        std::vector<uint32_t>().swap(recent);  // frees: after a data set it is as long as the table
+        recent = {};
     }
 
     // ---- eqs. (5) to (7). `found` is K(s_q).

@@ -562,6 +562,7 @@ template <class T>
 struct Tape {
     Compute& compute;
     bool recording = true;  // false: acting; no gradients, no dropout
+    size_t block = 0;       // which part of a batch this tape works on: parameters keep a gradient for each
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: a fresh mask for each
 
@@ -577,6 +578,9 @@ struct Tape {
         }
         return x;
     }
+
+    // Where this tape adds up the gradient of a parameter.
+    T* gradient(Tensor<T> parameter) const { return parameter.gradient + block * parameter.size(); }
 
     // An input: copied, without gradient.
     Tensor<T> constant(const float* data, int rows, int columns) {
@@ -667,18 +671,19 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         for (int j = 0; j < count; ++j) y.value[row * count + j] = bias.value[first + j];
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed}, x.rows,
            count, x.columns, Store::accumulate);
+    T *dw = tape.gradient(w) + offset, *db = tape.gradient(bias) + first;
     tape.on_backward([=, &compute] {
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
                    x.columns, count, Store::accumulate);
         if (transposed)  // dW^T += dy^T x
-            matmul(compute, View<T>{w.gradient + offset, w.columns}, {y.gradient, count, true}, {x.value, x.columns},
-                   count, x.columns, x.rows, Store::accumulate);
-        else  // dW += x^T dy
-            matmul(compute, View<T>{w.gradient + offset, w.columns}, {x.value, x.columns, true}, dy, x.columns, count,
+            matmul(compute, View<T>{dw, w.columns}, {y.gradient, count, true}, {x.value, x.columns}, count, x.columns,
                    x.rows, Store::accumulate);
-        add_column_sums(compute, bias.gradient + first, y.gradient, y.rows, count);
+        else  // dW += x^T dy
+            matmul(compute, View<T>{dw, w.columns}, {x.value, x.columns, true}, dy, x.columns, count, x.rows,
+                   Store::accumulate);
+        add_column_sums(compute, db, y.gradient, y.rows, count);
     });
     return y;
 }
@@ -730,6 +735,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
             }
         }
     });
+    T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward([=, &compute] {
         // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
         T* g_all = y.value;  // the output is not needed any more: its memory serves
@@ -743,43 +749,48 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
                 for (int j = 0; j < d; ++j) g[j] = dy[j] * n[j];
             }
         });
-        add_column_sums(compute, weight.gradient, g_all, x.rows, d);
-        add_column_sums(compute, bias.gradient, y.gradient, x.rows, d);
+        add_column_sums(compute, d_weight, g_all, x.rows, d);
+        add_column_sums(compute, d_bias, y.gradient, x.rows, d);
     });
     return y;
 }
 
-// Inverted dropout's factors for elements [begin, end) of one place in the network: 0 with probability p, 1 / (1 - p)
-// else. They come from the counter (update, place, element), so backward makes them again instead of storing them.
+// Inverted dropout's factors for the elements of one place in the network: 0 with probability p, 1 / (1 - p) else. They
+// come from the counter (update, place, element), so backward makes them again instead of storing them.
 struct Dropout {
     Random random;
     uint64_t step;
     uint32_t site;
     float probability;
 
-    // f(element, factor) for each element in [begin, end).
+    // f(first, last, factor) for the elements [begin, end) in chunks [first, last); element i has factor[i - first].
     template <class T, class F>
-    void each(size_t begin, size_t end, F&& f) const {
-        if (probability == 0) {
-            for (size_t i = begin; i < end; ++i) f(i, T(1));
-            return;
+    void each_chunk(size_t begin, size_t end, F&& f) const {
+        T factor[256];
+        for (size_t first = begin; first < end; first += 256) {
+            const size_t last = std::min(end, first + 256);
+            fill(factor, first, last);
+            f(first, last, factor);
         }
-        const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
+    }
+
+    template <class T>
+    void fill(T* factor, size_t first, size_t last) const {
         const T keep = T(1) / (T(1) - T(probability));
-        for (size_t block = begin / 4; block * 4 < end; ++block) {
-            const Words4 words = random.words(step, static_cast<uint32_t>(block), site);
-            const size_t first = std::max(begin, block * 4), last = std::min(end, block * 4 + 4);
-            if (last - first == 4)
-                for (size_t i = 0; i < 4; ++i) f(first + i, words[i] < threshold ? T(0) : keep);
-            else
-                for (size_t i = first; i < last; ++i) f(i, words[i % 4] < threshold ? T(0) : keep);
+        const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
+        if (probability == 0) std::fill_n(factor, last - first, T(1));
+        for (size_t i = first; probability != 0 && i < last;) {
+            const Words4 words = random.words(step, static_cast<uint32_t>(i / 4), site);
+            for (const size_t block_end = std::min(last, (i / 4 + 1) * 4); i < block_end; ++i)
+                factor[i - first] = words[i % 4] < threshold ? T(0) : keep;
         }
     }
 };
 
 template <class T>
 Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
-    return {tape.dropout_random, tape.dropout_step, site, tape.recording ? probability : 0.0f};
+    const uint32_t own_site = site + static_cast<uint32_t>(tape.block << 20);  // each part of a batch has its own masks
+    return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
 // y = residual + dropout(x), or dropout(x) if residual is empty; all [n, d].
@@ -788,17 +799,19 @@ Tensor<T> add_dropout(Tape<T>& tape, Tensor<T> residual, Tensor<T> x, Dropout dr
     const Tensor<T> y = tape.make(x.rows, x.columns);
     const size_t d = static_cast<size_t>(x.columns);
     Compute& compute = tape.compute;
-    for_rows(compute, x.rows, 16 * x.columns, [=](int begin, int end) {
-        dropout.each<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, [=](size_t i, T factor) {
-            y.value[i] = (residual.value ? residual.value[i] : T(0)) + factor * x.value[i];
+    const auto each_chunk = [=, &compute](auto&& f) {
+        for_rows(compute, x.rows, 16 * x.columns, [&](int begin, int end) {
+            dropout.each_chunk<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, f);
         });
+    };
+    each_chunk([=](size_t first, size_t last, const T* factor) {
+        for (size_t i = first; i < last; ++i) y.value[i] = factor[i - first] * x.value[i];
+        for (size_t i = first; residual.value && i < last; ++i) y.value[i] += residual.value[i];
     });
-    tape.on_backward([=, &compute] {
-        for_rows(compute, x.rows, 16 * x.columns, [=](int begin, int end) {
-            dropout.each<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, [=](size_t i, T factor) {
-                if (residual.value) residual.gradient[i] += y.gradient[i];
-                x.gradient[i] += factor * y.gradient[i];
-            });
+    tape.on_backward([=] {
+        each_chunk([=](size_t first, size_t last, const T* factor) {
+            for (size_t i = first; i < last; ++i) x.gradient[i] += factor[i - first] * y.gradient[i];
+            for (size_t i = first; residual.value && i < last; ++i) residual.gradient[i] += y.gradient[i];
         });
     });
     return y;
@@ -882,12 +895,13 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
                         w[j] = dot(query, key + static_cast<ptrdiff_t>(j) * 2 * d, size) * scale;
                     softmax(w, seen);
                     std::fill_n(o, size, T(0));
-                    dropout.each<T>(
-                        first_weight, first_weight + static_cast<size_t>(seen), [=](size_t element, T factor) {
-                            const size_t j = element - first_weight;
-                            for (int c = 0; c < size; ++c)
-                                o[c] += factor * w[j] * v[j * static_cast<size_t>(2 * d) + static_cast<size_t>(c)];
-                        });
+                    dropout.each_chunk<T>(first_weight, first_weight + static_cast<size_t>(seen),
+                                          [=](size_t first, size_t last, const T* factor) {
+                                              for (size_t j = first - first_weight; j < last - first_weight; ++j)
+                                                  for (int c = 0; c < size; ++c)
+                                                      o[c] += factor[first_weight + j - first] * w[j] *
+                                                              v[static_cast<ptrdiff_t>(j) * 2 * d + c];
+                                          });
                 }
     });
     T* d_weights = tape.template scratch<T>(tape.recording ? static_cast<size_t>(q.rows * heads) * row : 0);
@@ -903,14 +917,17 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
                         const T *w = weights + first_weight, *query = q.value + at, *d_out = out.gradient + at;
                         T *dw = d_weights + first_weight, *d_query = q.gradient + at;
                         // d_v_j += factor_j w_j d_out;  dw_j = factor_j v_j . d_out
-                        dropout.each<T>(first_weight, first_weight + static_cast<size_t>(seen),
-                                        [=](size_t element, T factor) {
-                                            const ptrdiff_t j = static_cast<ptrdiff_t>(element - first_weight);
-                                            const ptrdiff_t value = first_key + j * 2 * d + d;
-                                            dw[j] = factor * dot(kv.value + value, d_out, size);
-                                            for (int c = 0; c < size; ++c)
-                                                kv.gradient[value + c] += factor * w[j] * d_out[c];
-                                        });
+                        dropout.each_chunk<T>(
+                            first_weight, first_weight + static_cast<size_t>(seen),
+                            [=](size_t first, size_t last, const T* factors) {
+                                for (size_t element = first; element < last; ++element) {
+                                    const ptrdiff_t j = static_cast<ptrdiff_t>(element - first_weight),
+                                                    value = first_key + j * 2 * d + d;
+                                    const T factor = factors[element - first];
+                                    dw[j] = factor * dot(kv.value + value, d_out, size);
+                                    for (int c = 0; c < size; ++c) kv.gradient[value + c] += factor * w[j] * d_out[c];
+                                }
+                            });
                         // Through the softmax: d_score_j = w_j (dw_j - sum_m w_m dw_m).
                         const T mean = dot(w, dw, seen);
                         for (int j = 0; j < seen; ++j) {
@@ -943,7 +960,8 @@ template <class T>
 struct Parameter {
     std::string name;             // ODT's name in its state_dict
     std::vector<uint64_t> shape;  // as saved
-    std::vector<T> value, gradient;
+    std::vector<T> value;
+    std::vector<T> gradient;  // [blocks, size]: one for each part of a batch that is worked on by itself
     Tensor<T> tensor() { return {value.data(), gradient.data(), rows(), static_cast<int>(shape.back())}; }
     int rows() const { return shape.size() == 1 ? 1 : static_cast<int>(shape[0]); }
 };
@@ -1020,6 +1038,7 @@ struct Transformer {
         Affine<T> c_fc, mlp_proj;
     };
     TransformerConfig config;
+    size_t gradient_blocks;
     std::vector<Parameter<T>> parameters;  // in the order of construction
     Affine<T> embed_return, embed_state, embed_action;
     Tensor<T> embed_ordering;  // [max_timesteps, width]
@@ -1028,7 +1047,9 @@ struct Transformer {
     Norm<T> ln_f;
     Affine<T> predict_mean, predict_log_std;
 
-    Transformer(const TransformerConfig& c, uint32_t seed) : config(c) {
+    Transformer(const TransformerConfig& c, uint32_t seed, size_t batch_parts = 1)
+        : config(c),
+          gradient_blocks(batch_parts) {
         const int d = c.width;
         if (c.layers < 1 || c.heads < 1 || d < 1 || d % c.heads != 0)
             fail("nn.config",
@@ -1080,7 +1101,7 @@ struct Transformer {
         size_t size = 1;
         for (int extent : shape) size *= static_cast<size_t>(extent);
         parameter.value.resize(size);
-        parameter.gradient.resize(size);
+        parameter.gradient.resize(size * gradient_blocks);
         initialise(parameter, init, fan_in, seed, parameters.size());
         parameters.push_back(std::move(parameter));  // moving a vector keeps its memory: tensors stay valid
         return parameters.back().tensor();
@@ -1141,11 +1162,12 @@ void place_tokens(Tape<T>& tape, Tensor<T> to, const std::vector<int>& rows, Ten
     for (ptrdiff_t i = 0; i < from.rows; ++i)
         for (ptrdiff_t j = 0; j < d; ++j)
             to.value[row[i] * d + j] = from.value[i * d + j] + (table.value ? table.value[at[i] * d + j] : T(0));
+    T* d_table = table.value ? tape.gradient(table) : nullptr;
     tape.on_backward([=] {
         for (ptrdiff_t i = 0; i < from.rows; ++i)
             for (ptrdiff_t j = 0; j < d; ++j) {
                 from.gradient[i * d + j] += to.gradient[row[i] * d + j];
-                if (table.value) table.gradient[at[i] * d + j] += to.gradient[row[i] * d + j];
+                if (table.value) d_table[at[i] * d + j] += to.gradient[row[i] * d + j];
             }
     });
 }
@@ -1434,15 +1456,21 @@ inline double warmup_factor(uint64_t update, uint64_t warmup_updates) {
     return update + 1 >= warmup_updates ? 1.0 : static_cast<double>(update + 1) / static_cast<double>(warmup_updates);
 }
 
-// Sum of squares in double, in blocks of 4096 added in order, the blocks on all threads.
+// Sum of squares in double: eight lanes within a block of 4096, the blocks (on all threads) added in order.
 template <class T>
-double sum_of_squares(Compute& compute, const std::vector<T>& x) {
+double sum_of_squares(Compute& compute, const T* x, size_t n) {
     constexpr size_t block = 4096;
-    std::vector<double> sums((x.size() + block - 1) / block);
+    std::vector<double> sums((n + block - 1) / block);
     for_rows(compute, static_cast<int>(sums.size()), block, [&](int begin, int end) {
-        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
-            for (size_t i = b * block; i < std::min(x.size(), (b + 1) * block); ++i)
-                sums[b] += static_cast<double>(x[i]) * x[i];
+        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b) {
+            double lane[8] = {};
+            const size_t last = std::min(n, (b + 1) * block);
+            size_t i = b * block;
+            for (; i + 8 <= last; i += 8)
+                for (size_t j = 0; j < 8; ++j) lane[j] += static_cast<double>(x[i + j]) * x[i + j];
+            for (; i < last; ++i) lane[0] += static_cast<double>(x[i]) * x[i];
+            for (const double part : lane) sums[b] += part;
+        }
     });
     double total = 0;
     for (const double sum : sums) total += sum;
@@ -1476,12 +1504,25 @@ inline void adam_step(float* gradient, float* m, float* v, const float* value, s
     }
 }
 
+// Adds the gradients of all blocks, in order, to the first, and empties the others.
+template <class T>
+void join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
+    for (Parameter<T>& parameter : parameters) {
+        const int n = static_cast<int>(parameter.value.size()),
+                  blocks = static_cast<int>(parameter.gradient.size()) / n;
+        if (blocks == 1) continue;
+        T* gradient = parameter.gradient.data();
+        add_column_sums(compute, gradient, gradient + n, blocks - 1, n);
+        std::fill(parameter.gradient.begin() + n, parameter.gradient.end(), T(0));
+    }
+}
+
 // Norm of all gradients. Errors: nn.not_finite names the tensor.
 template <class T>
 double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
     double total = 0;
     for (const Parameter<T>& parameter : parameters) {
-        const double squares = sum_of_squares(compute, parameter.gradient);
+        const double squares = sum_of_squares(compute, parameter.gradient.data(), parameter.value.size());
         if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
         total += squares;
     }
@@ -1494,6 +1535,7 @@ double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& paramete
 // (gradient), or after (value).
 inline double update_parameters(Compute& compute, std::vector<Parameter<float>>& parameters, Optimizer& optimizer,
                                 const OptimizerConfig& config) {
+    join_gradients(compute, parameters);
     const double norm = gradient_norm(compute, parameters);
     // PyTorch's clip_grad_norm_: scale by limit / (norm + 1e-6) where that is below 1.
     const double scale = config.clip_norm > 0 ? std::min(1.0, config.clip_norm / (norm + 1e-6)) : 1.0;
@@ -1519,8 +1561,8 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         });
         double trust = 1;
         if (lamb && (config.weight_decay != 0 || config.always_adapt)) {
-            const double value_norm = std::sqrt(sum_of_squares(compute, parameter.value));
-            const double step_norm = std::sqrt(sum_of_squares(compute, parameter.gradient));
+            const double value_norm = std::sqrt(sum_of_squares(compute, parameter.value.data(), n));
+            const double step_norm = std::sqrt(sum_of_squares(compute, parameter.gradient.data(), n));
             if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
         }
         const float rate = static_cast<float>(learning_rate * trust);

@@ -236,7 +236,7 @@ Settings default_settings(const std::string& task, const std::string& method, co
     set_setting(settings, "task", task);
     set_setting(settings, "method", method);
     set_setting(settings, "preset", preset);
-    if (preset == "small") set_from(settings, "width", "16", "preset small: everything else as in Table I");
+    if (preset == "small") set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (method == "dt") {
         set_from(settings, "online_steps", "0", "DT learns offline only");
         set_from(settings, "initial_lambda", "1e-9", "DT has no entropy term: lambda is not used");
@@ -397,25 +397,46 @@ struct Progress {
     }
 };
 
-// Training state is exactly this; whatever is not here is not state, and the checkpoint cannot forget it.
+// A batch is worked on in parts of fixed size, each on a tape of its own, where the network is so small that keeping a
+// gradient for each costs less than sharing out every operation. By shape alone: results must not depend on threads.
+size_t parts_of_batch(const Settings& settings) {
+    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
+    return weights < 100000 ? static_cast<size_t>(std::min<int64_t>(8, settings.batch_size)) : 1;
+}
+
 struct Run {
+    // Training state is exactly this; whatever is not here is not state, and the checkpoint cannot forget it.
     Agent agent;
     Optimizer optimizer;
     Temperature temperature;
     ReplayBuffer replay;    // D_offline in the offline phase, D_online afterwards
     EpisodicMemory memory;  // Q
     Progress progress;
-    Tape<float> tape;  // scratch, empty between updates
 
-    Run(Compute& compute, const Settings& settings, const EnvironmentSpec& spec)
+    // What it is worked with.
+    Compute& compute;
+    std::vector<std::unique_ptr<Compute>> serial;     // one per part of a batch, if there are several
+    std::vector<std::unique_ptr<Tape<float>>> tapes;  // one per part of a batch
+    Tape<float> acting;
+
+    Run(Compute& c, const Settings& settings, const EnvironmentSpec& spec)
         : agent{settings,
                 spec,
-                Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed)),
+                Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed),
+                                   parts_of_batch(settings)),
                 {}},
           temperature(settings.initial_lambda),
           replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
           memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)),
-          tape(compute) {}
+          compute(c),
+          acting(c) {
+        const size_t parts = parts_of_batch(settings);
+        for (size_t part = 0; part < parts; ++part) {
+            if (parts > 1) serial.push_back(std::make_unique<Compute>(c.kernel, 1));
+            tapes.push_back(std::make_unique<Tape<float>>(parts > 1 ? *serial.back() : c));
+        }
+        acting.recording = false;  // and so no dropout
+    }
 
     Random random(Stream stream) const { return {static_cast<uint32_t>(agent.settings.seed), stream}; }
     bool remembers() const { return agent.settings.method == "wodtem"; }
@@ -445,42 +466,46 @@ void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const fl
     for (int i = 0; i < spec.action_dim; ++i) to.push_back(spec.moves > 0 ? action[i] : clamp_action(action[i]));
 }
 
-// One update's data: n steps of batch_size windows, packed.
+// One update's data, or a part of it: n steps of some of the batch_size windows, packed.
 struct Batch {
     SequenceBatch sequences;
     std::vector<float> actions;              // [n, action_dim] a_c
     std::vector<float> remembered;           // [n, action_dim] a-hat(s_c)
     std::vector<double> discounted_returns;  // [n] d_c
     std::vector<const float*> raw_states;    // [n] s_c, in the replay buffer
-    std::vector<float> mean;     // [n] 1 / (windows |C^t|): the mean over a window's steps, then over windows
-    std::vector<float> weights;  // [n] w(s_c, a_c)
+    std::vector<float> mean;                 // [n] 1 / (batch_size |C^t|): over a window's steps, then windows
+    std::vector<float> weights;              // [n] w(s_c, a_c)
+    std::vector<uint32_t> numbers;           // [n] window * context_length + step: who draws which random number
+    std::vector<std::vector<Neighbour>> neighbours;  // [n] K(s_c)
 };
 
 // WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t = the steps of the
 // window. departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up
 // to t.
-Batch sample_batch(const Run& run) {
+Batch sample_batch(const Run& run, uint32_t first_window, uint32_t end_window) {
     const Settings& settings = run.agent.settings;
     const EnvironmentSpec& spec = run.agent.spec;
+    const uint32_t context_length = static_cast<uint32_t>(settings.context_length);
     Batch batch;
-    for (uint32_t window = 0; window < settings.batch_size; ++window) {
+    for (uint32_t window = first_window; window < end_window; ++window) {
         const Window at = run.replay.sample(run.random(Stream::batch), run.progress.updates, window,
-                                            static_cast<int>(settings.context_length));
+                                            static_cast<int>(context_length));
         const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
         batch.sequences.lengths.push_back(at.length);
-        for (int t = at.start; t < at.start + at.length; ++t) {
-            const size_t step = static_cast<size_t>(t);
+        for (uint32_t c = 0; c < static_cast<uint32_t>(at.length); ++c) {
+            const size_t step = static_cast<size_t>(at.start) + c;
             const float* state = &trajectory.states[step * static_cast<size_t>(spec.state_dim)];
             const float* action = &trajectory.actions[step * static_cast<size_t>(spec.action_dim)];
             batch.sequences.returns_to_go.push_back(
                 static_cast<float>(trajectory.returns_to_go[step] * settings.reward_scale));
             append_normalised(batch.sequences.states, run.agent.normaliser, state);
             append_action_token(batch.sequences.actions, spec, action);
-            batch.sequences.timesteps.push_back(t);
+            batch.sequences.timesteps.push_back(static_cast<int>(step));
             append_action(batch.actions, spec, action);
             batch.discounted_returns.push_back(trajectory.discounted_returns[step]);
             batch.raw_states.push_back(state);
             batch.mean.push_back(1.0f / static_cast<float>(settings.batch_size * at.length));
+            batch.numbers.push_back(window * context_length + c);
         }
     }
     batch.remembered = batch.actions;
@@ -511,22 +536,33 @@ void remember(Run& run, Trajectory trajectory) {
 }
 
 // WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each
-// batch. Without a neighbour there is nothing against a_c: w = 1.
-void consult_memory(Run& run, Batch& batch) {
+// batch. Without a neighbour there is nothing against a_c: w = 1. Only reads the table: parts of a batch look up side
+// by side.
+void consult_memory(const Run& run, Batch& batch) {
     if (!run.remembers()) return;
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
     const Random random = run.random(Stream::remembered_action);
     for (size_t i = 0; i < batch.weights.size(); ++i) {
-        const std::vector<Neighbour> found = run.memory.neighbours(memory_key(run.agent, batch.raw_states[i]).data());
-        run.progress.unmatched_pairs += found.empty();
-        const double d = batch.discounted_returns[i];
-        batch.weights[i] = static_cast<float>(run.memory.weight(found, d, run.agent.settings.alpha));
-        if (run.memory.is_optimal(found, d)) continue;
-        run.progress.short_pairs += 1;
-        const float* action =
-            run.memory.remembered_action(found, random.uniform(run.progress.updates, static_cast<uint32_t>(i)));
-        for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
-            batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
+        std::vector<Neighbour> found = run.memory.search(memory_key(run.agent, batch.raw_states[i]).data());
+        batch.weights[i] =
+            static_cast<float>(run.memory.weight(found, batch.discounted_returns[i], run.agent.settings.alpha));
+        if (!run.memory.is_optimal(found, batch.discounted_returns[i])) {
+            const float* action =
+                run.memory.remembered_action(found, random.uniform(run.progress.updates, batch.numbers[i]));
+            for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
+                batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
+        }
+        batch.neighbours.push_back(std::move(found));
+    }
+}
+
+// What the table and the log want to know of a batch that has been looked up.
+void count_consultation(Run& run, const Batch& batch) {
+    run.progress.pairs += static_cast<double>(batch.mean.size());
+    for (size_t i = 0; i < batch.neighbours.size(); ++i) {
+        run.memory.count_accesses(batch.neighbours[i]);
+        run.progress.unmatched_pairs += batch.neighbours[i].empty();
+        run.progress.short_pairs += !run.memory.is_optimal(batch.neighbours[i], batch.discounted_returns[i]);
     }
 }
 
@@ -592,7 +628,7 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
 
 // WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar). Its gradient in log lambda is lambda (eta -
 // H-bar).
-void update_lambda(Run& run, Compute& compute, double entropy) {
+void update_lambda(Run& run, double entropy) {
     OptimizerConfig config;
     config.rule = OptimizerConfig::Rule::adamw;
     config.learning_rate = run.agent.settings.lambda_learning_rate;
@@ -600,37 +636,68 @@ void update_lambda(Run& run, Compute& compute, double entropy) {
     config.warmup_updates = 0;
     run.temperature.log_lambda[0].gradient[0] =
         static_cast<float>(-run.temperature.lambda() * (run.agent.settings.eta - entropy));
-    update_parameters(compute, run.temperature.log_lambda, run.temperature.optimizer, config);
+    update_parameters(run.compute, run.temperature.log_lambda, run.temperature.optimizer, config);
+}
+
+// A part of the batch: its share of the objective, forward and backward; parts run side by side.
+struct Part {
+    Batch batch;
+    double likelihood = 0, entropy = 0;
+    std::exception_ptr problem;
+};
+
+void learn_part(Run& run, Part& part, uint32_t number) {
+    const uint32_t parts = static_cast<uint32_t>(run.tapes.size()),
+                   windows = static_cast<uint32_t>(run.agent.settings.batch_size);
+    Tape<float>& tape = *run.tapes[number];
+    tape.reset();
+    tape.recording = true;
+    tape.block = number;
+    tape.dropout_random = run.random(Stream::dropout);
+    tape.dropout_step = run.progress.updates;
+    part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
+    consult_memory(run, part.batch);
+
+    const Head head = run.agent.model.config.head;
+    std::vector<float> noise;
+    for (size_t i = 0; head == Head::squashed_gaussian && i < part.batch.actions.size(); ++i) {
+        const size_t dim = static_cast<size_t>(run.agent.spec.action_dim);
+        noise.push_back(run.random(Stream::entropy_noise)
+                            .normal(run.progress.updates, part.batch.numbers[i / dim], static_cast<uint32_t>(i % dim)));
+    }
+    const Policy<float> policy = forward(tape, run.agent.model, part.batch.sequences, Ask::every_state);
+    const Objective<float> result =
+        objective(tape, head, policy, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
+    tape.backward(result.loss);
+    part.likelihood = result.likelihood.value[0];
+    if (run.constrains_entropy()) part.entropy = result.entropy.value[0];
 }
 
 // One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
 void update(Run& run) {
-    Compute& compute = run.tape.compute;
-    Tape<float>& tape = run.tape;
-    const Head head = run.agent.model.config.head;
-    tape.reset();
-    tape.recording = true;
-    tape.dropout_random = run.random(Stream::dropout);
-    tape.dropout_step = run.progress.updates;
-
-    Batch batch = sample_batch(run);
-    consult_memory(run, batch);
-    std::vector<float> noise;
-    for (uint32_t i = 0; head == Head::squashed_gaussian && i < batch.actions.size(); ++i)
-        noise.push_back(run.random(Stream::entropy_noise).normal(run.progress.updates, i));
-    const Policy<float> policy = forward(tape, run.agent.model, batch.sequences, Ask::every_state);
-    const Objective<float> result =
-        objective(tape, head, policy, batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
-    if (!std::isfinite(result.loss.value[0])) fail("nn.not_finite", "the loss is not finite");
-    tape.backward(result.loss);
-    run.progress.gradient_norm +=
-        update_parameters(compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
-    if (run.constrains_entropy()) {
-        update_lambda(run, compute, result.entropy.value[0]);
-        run.progress.entropy += result.entropy.value[0];
+    std::vector<Part> parts(run.tapes.size());
+    run.memory.refresh_index();
+    run.compute.threads.run(static_cast<int>(parts.size()), [&](int number, int) {
+        Part& part = parts[static_cast<size_t>(number)];
+        try {
+            learn_part(run, part, static_cast<uint32_t>(number));
+        } catch (...) {
+            part.problem = std::current_exception();
+        }
+    });
+    double likelihood = 0, entropy = 0;
+    for (const Part& part : parts) {
+        if (part.problem) std::rethrow_exception(part.problem);
+        count_consultation(run, part.batch);
+        likelihood += part.likelihood;
+        entropy += part.entropy;
     }
-    run.progress.loss += result.likelihood.value[0];
-    run.progress.pairs += static_cast<double>(batch.mean.size());
+    if (!std::isfinite(likelihood + entropy)) fail("nn.not_finite", "the loss is not finite");
+    run.progress.gradient_norm +=
+        update_parameters(run.compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
+    if (run.constrains_entropy()) update_lambda(run, entropy);
+    run.progress.loss += likelihood;
+    run.progress.entropy += entropy;
     run.progress.summed_updates += 1;
     run.progress.updates += 1;
 }
@@ -711,12 +778,11 @@ std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act,
         episodes[i].returns_to_go = {static_cast<float>(target * agent.settings.reward_scale)};
         environments[i].reset(run.random(Stream::environment), first_episode + i, episodes[i].state.data());
     }
-    run.tape.recording = false;  // and so no dropout
     for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps); ++t) {
         const SequenceBatch batch = acting_batch(agent, episodes);
         if (batch.lengths.empty()) break;
-        run.tape.reset();
-        const Policy<float> policy = forward(run.tape, agent.model, batch, Ask::last_state);
+        run.acting.reset();
+        const Policy<float> policy = forward(run.acting, agent.model, batch, Ask::last_state);
         int row = 0;
         for (size_t i = 0; i < episodes.size(); ++i) {
             Episode& episode = episodes[i];
@@ -1113,9 +1179,8 @@ std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
         append_normalised(batch.states, run.agent.normaliser, state.data());
         batch.actions.resize(batch.actions.size() + grid_moves);
     }
-    run.tape.reset();
-    run.tape.recording = false;
-    const Policy<float> policy = forward(run.tape, run.agent.model, batch, Ask::last_state);
+    run.acting.reset();
+    const Policy<float> policy = forward(run.acting, run.agent.model, batch, Ask::last_state);
     std::vector<std::vector<float>> probabilities(grid_cells);
     for (size_t i = 0; i < policy.mean.size(); ++i)
         probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));

@@ -1252,11 +1252,16 @@ TEST(dropout_keeps_its_share_and_scales_it_up) {
 
 TEST(dropout_in_pieces_equals_dropout_of_the_whole) {
     const Dropout dropout = {{test_seed(), Stream::dropout}, 1, 2, 0.5f};
-    std::vector<double> whole(50), pieces(50);
-    dropout.each<double>(0, 50, [&](size_t i, double factor) { whole[i] = factor; });
-    for (size_t begin = 0; begin < 50; begin += 7)
-        dropout.each<double>(begin, std::min<size_t>(50, begin + 7),
-                             [&](size_t i, double factor) { pieces[i] += factor; });
+    const size_t n = 700;  // more than a chunk
+    std::vector<double> whole(n), pieces(n);
+    const auto add_to = [](std::vector<double>& to) {
+        return [&to](size_t first, size_t last, const double* factor) {
+            for (size_t i = first; i < last; ++i) to[i] += factor[i - first];
+        };
+    };
+    dropout.each_chunk<double>(0, n, add_to(whole));
+    for (size_t begin = 0; begin < n; begin += 7)
+        dropout.each_chunk<double>(begin, std::min(n, begin + 7), add_to(pieces));
     CHECK(same_bits(whole, pieces));
 }
 

@@ -269,7 +269,7 @@ TEST(lambda_falls_when_the_entropy_is_above_eta_and_rises_below) {
     for (const double entropy : {1.9, 1.1}) {
         Fixture f(settings);
         const double before = f.run.temperature.log_lambda[0].value[0];
-        update_lambda(f.run, f.compute, entropy);
+        update_lambda(f.run, entropy);
         CHECK_CLOSE(f.run.temperature.log_lambda[0].value[0] - before, entropy > 1.5 ? -1e-4 : 1e-4, 1e-6);
     }
 }
@@ -281,7 +281,7 @@ TEST(batches_hold_what_the_buffer_holds) {
     Settings settings = tiny_settings("wodtem");
     set_setting(settings, "context_length", "4");
     Fixture f(settings);
-    const Batch batch = sample_batch(f.run);
+    const Batch batch = sample_batch(f.run, 0, static_cast<uint32_t>(f.run.agent.settings.batch_size));
     double sum = 0;
     size_t step = 0;
     for (uint32_t window = 0; window < 32; ++window) {
@@ -331,8 +331,9 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
                 best[cell] = {trajectory.discounted_returns[t], trajectory.actions[t]};
         }
     CHECK_EQUAL(f.run.memory.size(), best.size());
-    Batch batch = sample_batch(f.run);
+    Batch batch = sample_batch(f.run, 0, static_cast<uint32_t>(f.run.agent.settings.batch_size));
     consult_memory(f.run, batch);
+    count_consultation(f.run, batch);
     double short_pairs = 0;
     for (size_t i = 0; i < batch.weights.size(); ++i) {
         const auto [d, a] = best.at({batch.raw_states[i][0], batch.raw_states[i][1]});
