@@ -7,6 +7,7 @@
 // the online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit. Promises: a run is a function of
 // its settings: the same bytes for any number of threads, in one go or continued.
 
+#include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <chrono>
@@ -479,9 +480,8 @@ struct Batch {
     std::vector<std::vector<Neighbour>> neighbours;  // [n] K(s_c)
 };
 
-// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t = the steps of the
-// window. departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up
-// to t.
+// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t: the steps of a window.
+// departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up to t.
 Batch sample_batch(const Run& run, uint32_t first_window, uint32_t end_window) {
     const Settings& settings = run.agent.settings;
     const EnvironmentSpec& spec = run.agent.spec;
@@ -607,10 +607,9 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
         advised[i] = -batch.mean[i] * (1.0f - batch.weights[i]);
     }
     Objective<T> result;
-    // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat(s_c) | s^c,
-    // g^c) ] WODTEM eq. (2): J is L with w = 1. Both terms read the same distribution; the action tokens stay the
-    // buffer's. departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over
-    // all steps.
+    // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
+    // WODTEM eq. (2): J is L with w = 1. Both terms read one distribution; the action tokens stay the buffer's.
+    // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over all steps.
     result.likelihood =
         combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()),
                 T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
@@ -626,8 +625,7 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     return result;
 }
 
-// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar). Its gradient in log lambda is lambda (eta -
-// H-bar).
+// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar); by log lambda, whose gradient is the same number.
 void update_lambda(Run& run, double entropy) {
     OptimizerConfig config;
     config.rule = OptimizerConfig::Rule::adamw;
@@ -983,29 +981,50 @@ struct Console {
         if (terminal ? seconds_between(shown, now) < 0.1 && share < 1 : new_tenth == tenth) return;
         shown = now;
         tenth = new_tenth;
+        std::string text = label + " " + phase + " " + bar(share) + numbers(run, now);
+        if (share > first_share && share < 1) {
+            const int left = static_cast<int>(seconds_between(started, now) / (share - first_share) * (1 - share));
+            text += ", " + clock_text(left) + " left";
+        }
+        if (terminal) text.resize(std::min(text.size(), columns() - 1));  // a line that wraps cannot be drawn over
+        std::fprintf(stderr, terminal ? "\r%s\033[K%s" : "%s%s\n", text.c_str(), terminal && share >= 1 ? "\n" : "");
+    }
+
+    std::string bar(double share) const {
+        const size_t width = 12, filled = static_cast<size_t>(share * static_cast<double>(width));
+        char percent[16];
+        std::snprintf(percent, sizeof percent, "%3.0f%%", 100 * share);
+        return terminal ? "[" + std::string(filled, '#') + std::string(width - filled, '.') + "]" + percent : percent;
+    }
+
+    // Loss and entropy since the last evaluation, length and return of the last evaluation, updates a second.
+    std::string numbers(const Run& run, Clock::time_point now) const {
         const Progress& p = run.progress;
-        const double elapsed = seconds_between(started, now), gained = share - first_share;
-        const double left = gained > 0 ? elapsed / gained * (1 - share) : NAN;
-        const double updates = std::max(1.0, p.summed_updates);
-        const int width = 20, filled = static_cast<int>(share * width);
-        std::string text = label + " " + phase;
-        if (terminal)
-            text += " [" + std::string(static_cast<size_t>(filled), '#') +
-                    std::string(static_cast<size_t>(width - filled), '.') + "]";
-        char numbers[256];
-        std::snprintf(
-            numbers, sizeof numbers,
-            " %3.0f%%  update %llu  interactions %llu  loss %.3f  entropy %.3f  length %.4g  return %.3g  %.0f updates/s",
-            100 * share, static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.interactions),
-            p.loss / updates, p.entropy / updates, p.eval_length, p.eval_return,
-            static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_between(began, now)));
-        text += numbers;
-        if (std::isfinite(left))
-            std::snprintf(numbers, sizeof numbers, "  %d:%02d left", static_cast<int>(left) / 60,
-                          static_cast<int>(left) % 60);
-        if (std::isfinite(left)) text += numbers;
-        std::fprintf(stderr, terminal ? "\r%s\033[K" : "%s\n", text.c_str());
-        if (terminal && share >= 1) std::fprintf(stderr, "\n");
+        char text[200];
+        int used = std::snprintf(text, sizeof text, " upd %llu, int %llu", static_cast<unsigned long long>(p.updates),
+                                 static_cast<unsigned long long>(p.interactions));
+        const auto add = [&](const char* format, double x) {
+            if (std::isfinite(x))
+                used += std::snprintf(text + used, sizeof text - static_cast<size_t>(used), format, x);
+        };
+        add(", loss %.2f", p.summed_updates > 0 ? p.loss / p.summed_updates : NAN);
+        add(", ent %.2f", p.summed_updates > 0 && run.constrains_entropy() ? p.entropy / p.summed_updates : NAN);
+        add(", len %.4g", p.eval_length);
+        add(", ret %.3g", p.eval_return);
+        add(", %.0f/s", static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_between(began, now)));
+        return text;
+    }
+
+    static std::string clock_text(int seconds) {
+        char text[32];
+        std::snprintf(text, sizeof text, seconds >= 3600 ? "%d:%02d:%02d" : "%.0d%d:%02d", seconds / 3600,
+                      seconds / 60 % 60, seconds % 60);
+        return text;
+    }
+
+    static size_t columns() {
+        winsize size{};
+        return ioctl(STDERR_FILENO, TIOCGWINSZ, &size) == 0 && size.ws_col > 20 ? size.ws_col : 80;
     }
 
     Clock::time_point began = Clock::now();
@@ -1092,8 +1111,8 @@ void offline_phase(Run& run, Session<Environment>& session) {
     evaluate_and_record(run, session);
 }
 
-// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout); it
-// enters D_online first in, first out, and the table at once, before the updates that follow it.
+// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout). It enters
+// D_online first in, first out, and the table at once, before the updates that follow it.
 template <class Environment>
 void interact(Run& run, Session<Environment>& session) {
     Progress& p = run.progress;
@@ -1269,7 +1288,7 @@ struct TrainOptions {
 
 void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
     Session<GridWorld> session{make_environment(settings), {path}, {}, options.checkpoint_every};
-    session.console.label = settings.task + " " + settings.method + " seed " + std::to_string(settings.seed);
+    session.console.label = settings.method + " " + std::to_string(settings.seed);
     claim_folder(settings, session.folder);
     if (fs::exists(session.folder.file("finished"))) {
         std::printf("%s is finished already\n", path.c_str());
@@ -1456,15 +1475,39 @@ void command_report(const Arguments& arguments) {
     std::printf("report: %s/report.html\n", out.c_str());
 }
 
+// How long an update takes here, times how many there will be: offline_updates, and updates_per_iteration for each
+// episode. The episodes are not known beforehand; those of preset small, seed 0, stand in: 2028 of WODTEM, 531 of ODT.
+double estimated_seconds(const Settings& settings) {
+    Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
+    const GridWorld environment = make_environment(settings);
+    Run run(compute, settings, environment.spec());
+    begin_run(run, make_data_set(settings, environment));
+    update(run);
+    const auto begin = Console::Clock::now();
+    for (int i = 0; i < 3; ++i) update(run);
+    const double update_seconds = Console::seconds_between(begin, Console::Clock::now()) / 3;
+    const double episodes = settings.method == "dt" ? 0 : settings.method == "odt" ? 531 : 2028;
+    return update_seconds * (static_cast<double>(settings.offline_updates) +
+                             episodes * static_cast<double>(settings.updates_per_iteration));
+}
+
 void command_sweep(const Arguments& arguments) {
-    const std::vector<std::string> methods = split(arguments["--methods"], ',');
-    for (const std::string& method : methods)
-        for (const int64_t seed : seed_list(arguments["--seeds"])) {
-            const Settings settings = default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0],
-                                                       method, arguments["--preset"]);
-            std::printf("./wodtem train %s --method %s --preset %s --seed %lld\n", settings.task.c_str(),
-                        settings.method.c_str(), settings.preset.c_str(), static_cast<long long>(seed));
-        }
+    const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
+    double seconds = 0;
+    for (const std::string& method : split(arguments["--methods"], ',')) {
+        const Settings settings =
+            default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0], method, arguments["--preset"]);
+        if (!arguments["--estimate"].empty())
+            seconds += estimated_seconds(settings) * static_cast<double>(seeds.size());
+        for (const int64_t seed : seeds)
+            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld\n",
+                        arguments["--estimate"].empty() ? "" : "# ", settings.task.c_str(), settings.method.c_str(),
+                        settings.preset.c_str(), static_cast<long long>(seed));
+    }
+    if (!arguments["--estimate"].empty())
+        std::printf(
+            "# about %.1f hours on this machine, one after the other; whatever is interrupted continues with the same command\n",
+            seconds / 3600);
 }
 
 template <class T>
@@ -1516,120 +1559,7 @@ void command_tasks(const Arguments&) {
         "gridworld", spec.state_dim, spec.moves, spec.max_episode_steps, 500);
 }
 
-// ---- bench
-
-double seconds_of(const std::function<void()>& work) {
-    const auto begin = Console::Clock::now();
-    work();
-    return Console::seconds_between(begin, Console::Clock::now());
-}
-
-struct Spread {
-    double low, median, high;
-};
-
-// Of `rounds` runs, after one that does not count.
-Spread timed(int rounds, const std::function<void()>& work) {
-    work();
-    std::vector<double> seconds;
-    for (int round = 0; round < rounds; ++round) seconds.push_back(seconds_of(work));
-    std::sort(seconds.begin(), seconds.end());
-    return {seconds.front(), seconds[seconds.size() / 2], seconds.back()};
-}
-
-// The shapes of the paper's grid-world network at batch 256, and of a gym network's layer on 1024 tokens.
-void bench_products(const Kernel& kernel) {
-    Compute compute(kernel, 1);
-    volatile float sink = 0;
-    const double burn = 2e9 / burn_flops(kernel);
-    const Spread peak = timed(7, [&] { sink = sink + kernel.burn(static_cast<int64_t>(burn)); });
-    const double peak_rate = 2e9 / peak.low / 1e9;
-    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only; median %.1f)\n", kernel.name, peak_rate,
-                2e9 / peak.median / 1e9);
-    struct Case {
-        const char* what;
-        int M, N, K;
-        bool a_transposed, b_transposed;
-    };
-    for (const Case& s :
-         {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
-          Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
-          Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
-          Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
-        const auto size = [](int rows, int columns) {
-            return static_cast<size_t>(rows) * static_cast<size_t>(columns);
-        };
-        const std::vector<float> a(size(s.M, s.K), 0.5f), b(size(s.K, s.N), 0.25f);
-        std::vector<float> c(size(s.M, s.N));
-        const double flops = 2.0 * s.M * s.N * s.K;
-        const int repeats = std::max(1, static_cast<int>(5e8 / flops));
-        const Spread time = timed(7, [&] {
-            for (int i = 0; i < repeats; ++i)
-                matmul(compute, View<float>{c.data(), s.N}, {a.data(), s.a_transposed ? s.M : s.K, s.a_transposed},
-                       {b.data(), s.b_transposed ? s.K : s.N, s.b_transposed}, s.M, s.N, s.K, Store::overwrite);
-        });
-        const double rate = flops * repeats / time.median / 1e9;
-        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N,
-                    s.K, rate, 100 * rate / peak_rate, 100 * flops * repeats / time.high / 1e9 / peak_rate,
-                    100 * flops * repeats / time.low / 1e9 / peak_rate);
-    }
-}
-
-// Arithmetic of one update that the action prediction needs, K = 1 and one layer: forward 14 d^2 products a window, and
-// twice that backward.
-void bench_update(const Kernel& kernel, int threads, const char* preset) {
-    Compute compute(kernel, threads);
-    const Settings settings = default_settings("gridworld", "wodtem", preset);
-    const GridWorld world;
-    Run run(compute, settings, world.spec());
-    begin_run(run, make_data_set(settings, world));
-    const int repeats = std::string(preset) == "small" ? 200 : 1;
-    const Spread time = timed(7, [&] {
-        for (int i = 0; i < repeats; ++i) update(run);
-    });
-    const double flops = 84.0 * static_cast<double>(settings.width * settings.width * settings.batch_size) * repeats;
-    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n",
-                preset, static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s",
-                time.median / repeats * 1e3, time.low / repeats * 1e3, time.high / repeats * 1e3,
-                flops / time.median / 1e9);
-}
-
-// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
-void bench_memory(size_t entries) {
-    MemoryConfig config{};
-    config.state_dim = config.projected_dim = 4;
-    config.action_dim = 8;
-    config.capacity = entries;
-    config.K = 2;
-    config.epsilon = 0.1;
-    EpisodicMemory memory(config, 0);
-    const Random random{1, Stream::data_set};
-    const auto state_of = [&](size_t i) {
-        std::array<float, 4> state;
-        for (uint32_t j = 0; j < 4; ++j) state[j] = static_cast<float>(10 * random.uniform(i, j));
-        return state;
-    };
-    const std::array<float, 8> action{};
-    EpisodicMemory::Changes changes;
-    const double insertion = seconds_of([&] {
-        for (size_t i = 0; i < entries; ++i) memory.update_one(changes, state_of(i).data(), action.data(), 1.0);
-    });
-    const double build = seconds_of([&] { memory.rebuild_index(); });
-    constexpr size_t queries = 20000;
-    size_t at = 0;
-    const Spread time = timed(7, [&] {
-        for (size_t i = 0; i < queries; ++i) {
-            std::array<float, 4> state = state_of((at += 7919) % entries);
-            state[0] += 0.01f;
-            memory.neighbours(state.data());
-        }
-    });
-    std::printf(
-        "  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
-        entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6,
-        insertion / static_cast<double>(entries) * 1e6, build,
-        static_cast<double>(memory.bytes()) / static_cast<double>(entries));
-}
+#include "tests/bench.hpp"
 
 void command_bench(const Arguments& arguments) {
     const Kernel& chosen = choose_kernel(arguments["--kernel"]);
@@ -1681,7 +1611,8 @@ const std::vector<Command>& commands() {
          "print one train command per method and seed, for any job runner",
          {{"--methods", "LIST", "dt,odt,wodtem", "methods, separated by commas"},
           {"--seeds", "A-B", "0-4", "seeds"},
-          preset_option},
+          preset_option,
+          {"--estimate", nullptr, "", "say how long the runs would take, as comments"}},
          command_sweep},
         {"info", "FILE", 1, 1, "what is in a model or checkpoint: names, shapes, ranges, checksum", {}, command_info},
         {"bench",
@@ -1736,6 +1667,10 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
                 fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
             fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, words[i].c_str(),
                  nearest_name(words[i], names).c_str());
+        }
+        if (!option->value) {
+            arguments.options[option->name] = "yes";
+            continue;
         }
         if (i + 1 == words.size()) fail("usage.option", "option %s needs a value: %s", option->name, option->value);
         const std::string& value = words[++i];

@@ -1,9 +1,9 @@
 // figures.hpp: figures as SVG text, the report page as one HTML file, and the small tables between them and CSV.
 //
-//   +---------------------------------------+   720 units wide and set in type of 13 and more, so that it can be read
-//   at | title                                 |   half that width. Colours: Okabe and Ito's, distinct to colour-blind
-//   eyes; | y |  grid, bands, lines or bars       |   the background is painted, so that figures read on dark pages
-//   too. |   +---------------------------------  |   The legend has its own rows below the plot: it never covers data.
+//   +---------------------------------------+   720 units wide and set in type of 13 and more, so that it can be read at
+//   | title                                 |   half that width. Colours: Okabe and Ito's, distinct to colour-blind eyes;
+//   | y |  grid, bands, lines or bars       |   the background is painted, so that figures read on dark pages too.
+//   |   +---------------------------------  |   The legend has its own rows below the plot: it never covers data.
 //   |      x ticks, x label, legend rows    |
 //   +---------------------------------------+
 //
@@ -28,15 +28,8 @@
 // ---------------------------------------------------------------------------------------------------------------------
 // What to draw
 
-enum class Colour {
-    blue,
-    vermillion,
-    green,
-    purple,
-    orange,
-    sky,
-    black
-};  // fixed by the caller: one method, one colour
+// Fixed by the caller: one method, one colour.
+enum class Colour { blue, vermillion, green, purple, orange, sky, black };
 
 struct Series {
     std::string label;
@@ -52,7 +45,7 @@ struct LineChart {
     std::string title, x_label, y_label;  // labels with units
     std::vector<Series> series;
     std::vector<Reference> references;
-    bool log_y = false;  // values that are not positive are left out
+    bool log_y = false;      // values that are not positive are left out
     double y_floor = -1e30;  // no value can lie below: bands are cut there
 };
 

@@ -693,3 +693,20 @@ TEST(every_equation_is_tagged_in_the_code_and_in_a_test) {
         if (tests.find(tag + " test") == std::string::npos) report_failure(__FILE__, __LINE__, "no test for " + tag);
     }
 }
+
+// The table of equations in README.md: its last column names tests.
+TEST(every_test_that_the_readme_names_exists) {
+    std::istringstream readme(read_file("README.md"));
+    int named = 0;
+    for (std::string line; std::getline(readme, line);) {
+        if (!line.starts_with("| (") && !line.starts_with("| sec.")) continue;
+        const std::vector<std::string> cells = split(line, '|');
+        const std::vector<std::string> parts = split(cells[cells.size() - 2], '`');
+        for (size_t i = 1; i < parts.size(); i += 2, ++named) {
+            const auto is_it = [&](const Test& test) { return parts[i] == test.name; };
+            if (std::none_of(all_tests().begin(), all_tests().end(), is_it))
+                report_failure(__FILE__, __LINE__, "README.md names no test: " + parts[i]);
+        }
+    }
+    CHECK(named >= 12);
+}

@@ -1,0 +1,118 @@
+// bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's fp32 peak with
+// registers alone, each kernel's share of it at the shapes that training uses, one update, one memory look-up.
+// Medians and ranges; a machine's clock moves with its neighbours, so figures of different runs do not compare.
+// Included by wodtem.cpp, after training. Leaves out: judging; a test never looks at a clock.
+#pragma once
+
+double seconds_of(const std::function<void()>& work) {
+    const auto begin = Console::Clock::now();
+    work();
+    return Console::seconds_between(begin, Console::Clock::now());
+}
+
+struct Spread {
+    double low, median, high;
+};
+
+// Of `rounds` runs, after one that does not count.
+Spread timed(int rounds, const std::function<void()>& work) {
+    work();
+    std::vector<double> seconds;
+    for (int round = 0; round < rounds; ++round) seconds.push_back(seconds_of(work));
+    std::sort(seconds.begin(), seconds.end());
+    return {seconds.front(), seconds[seconds.size() / 2], seconds.back()};
+}
+
+// The shapes of the paper's grid-world network at batch 256, and of a gym network's layer on 1024 tokens.
+void bench_products(const Kernel& kernel) {
+    Compute compute(kernel, 1);
+    volatile float sink = 0;
+    const double burn = 2e9 / burn_flops(kernel);
+    const Spread peak = timed(7, [&] { sink = sink + kernel.burn(static_cast<int64_t>(burn)); });
+    const double peak_rate = 2e9 / peak.low / 1e9;
+    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only; median %.1f)\n", kernel.name, peak_rate,
+                2e9 / peak.median / 1e9);
+    struct Case {
+        const char* what;
+        int M, N, K;
+        bool a_transposed, b_transposed;
+    };
+    for (const Case& s :
+         {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
+          Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
+          Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
+          Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
+        const auto size = [](int rows, int columns) {
+            return static_cast<size_t>(rows) * static_cast<size_t>(columns);
+        };
+        const std::vector<float> a(size(s.M, s.K), 0.5f), b(size(s.K, s.N), 0.25f);
+        std::vector<float> c(size(s.M, s.N));
+        const double flops = 2.0 * s.M * s.N * s.K;
+        const int repeats = std::max(1, static_cast<int>(5e8 / flops));
+        const Spread time = timed(7, [&] {
+            for (int i = 0; i < repeats; ++i)
+                matmul(compute, View<float>{c.data(), s.N}, {a.data(), s.a_transposed ? s.M : s.K, s.a_transposed},
+                       {b.data(), s.b_transposed ? s.K : s.N, s.b_transposed}, s.M, s.N, s.K, Store::overwrite);
+        });
+        const double rate = flops * repeats / time.median / 1e9;
+        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N,
+                    s.K, rate, 100 * rate / peak_rate, 100 * flops * repeats / time.high / 1e9 / peak_rate,
+                    100 * flops * repeats / time.low / 1e9 / peak_rate);
+    }
+}
+
+// Arithmetic of one update that the action prediction needs, K = 1 and one layer: forward 14 d^2 products a window, and
+// twice that backward.
+void bench_update(const Kernel& kernel, int threads, const char* preset) {
+    Compute compute(kernel, threads);
+    const Settings settings = default_settings("gridworld", "wodtem", preset);
+    const GridWorld world;
+    Run run(compute, settings, world.spec());
+    begin_run(run, make_data_set(settings, world));
+    const int repeats = std::string(preset) == "small" ? 200 : 1;
+    const Spread time = timed(7, [&] {
+        for (int i = 0; i < repeats; ++i) update(run);
+    });
+    const double flops = 84.0 * static_cast<double>(settings.width * settings.width * settings.batch_size) * repeats;
+    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n",
+                preset, static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s",
+                time.median / repeats * 1e3, time.low / repeats * 1e3, time.high / repeats * 1e3,
+                flops / time.median / 1e9);
+}
+
+// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
+void bench_memory(size_t entries) {
+    MemoryConfig config{};
+    config.state_dim = config.projected_dim = 4;
+    config.action_dim = 8;
+    config.capacity = entries;
+    config.K = 2;
+    config.epsilon = 0.1;
+    EpisodicMemory memory(config, 0);
+    const Random random{1, Stream::data_set};
+    const auto state_of = [&](size_t i) {
+        std::array<float, 4> state;
+        for (uint32_t j = 0; j < 4; ++j) state[j] = static_cast<float>(10 * random.uniform(i, j));
+        return state;
+    };
+    const std::array<float, 8> action{};
+    EpisodicMemory::Changes changes;
+    const double insertion = seconds_of([&] {
+        for (size_t i = 0; i < entries; ++i) memory.update_one(changes, state_of(i).data(), action.data(), 1.0);
+    });
+    const double build = seconds_of([&] { memory.rebuild_index(); });
+    constexpr size_t queries = 20000;
+    size_t at = 0;
+    const Spread time = timed(7, [&] {
+        for (size_t i = 0; i < queries; ++i) {
+            std::array<float, 4> state = state_of((at += 7919) % entries);
+            state[0] += 0.01f;
+            memory.neighbours(state.data());
+        }
+    });
+    std::printf(
+        "  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
+        entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6,
+        insertion / static_cast<double>(entries) * 1e6, build,
+        static_cast<double>(memory.bytes()) / static_cast<double>(entries));
+}
