@@ -34,8 +34,8 @@ run: wodtem
 
 paper-gridworld: wodtem
 	./wodtem sweep gridworld --preset paper --seeds 0-4 --estimate
-	./wodtem sweep gridworld --preset paper --seeds 0-4 | sh
-	./wodtem report runs/gridworld-paper-*
+	./wodtem sweep gridworld --preset paper --seeds 0-4 | sh -e
+	./wodtem report --out runs/report-paper runs/gridworld-paper-*
 
 # One object per test file, so that make -j helps; test_wodtem.cpp includes wodtem.cpp.
 build/%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
@@ -55,12 +55,12 @@ build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
 build/tests-sanitized: $(TESTS:%=build/san-%.o)
 	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@
 
-build/tests-threads: tests/main.cpp tests/test_nn.cpp $(HEADERS)
+build/tests-threads: tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp wodtem.cpp $(HEADERS) | compiler
 	@mkdir -p build
-	$(CXX) $(CXXFLAGS) -O1 -fsanitize=thread tests/main.cpp tests/test_nn.cpp -o $@
+	$(CXX) $(CXXFLAGS) -O1 -fsanitize=thread tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp -o $@
 
 sanitize: wodtem build/tests-sanitized build/tests-threads
-	build/tests-threads thread
+	build/tests-threads threads number_of_threads
 	build/tests-sanitized
 
 bench: wodtem

@@ -634,7 +634,8 @@ struct EpisodicMemory {
 
     // ---- eqs. (5) to (7). `found` is K(s_q).
 
-    // exp(-q_k) over exp(-q_1), the largest: the quotient in (5) is the same and no epsilon can make it 0 / 0.
+    // exp(-q_k) over exp(-q_1), the largest: the quotient in (5) is the same and no epsilon can make it 0 / 0. The float
+    // exp: libm's in double gives other bits on other processors. Sums are in double.
     static double similarity(const std::vector<Neighbour>& found, size_t k) {
         return std::exp(found[0].distance - found[k].distance);
     }

@@ -67,15 +67,16 @@ inline Words4 philox(Words4 counter, uint32_t key0, uint32_t key1) {
 // Each use of chance has its own stream: switching one feature on or off moves no other's numbers. The values are part
 // of the format of a run (a porter needs them); never renumber.
 enum class Stream : uint32_t {
-    initialisation = 1,     // step: tensor number; index: element
-    dropout = 2,            // step: update; site: place in the network; index: element
-    batch = 3,              // step: update; index: window of the batch
-    exploration = 4,        // step: online episode; site: action dimension; index: time-step
-    remembered_action = 5,  // eq. (6). step: update; index: position in the batch
-    entropy_noise = 6,      // step: update; site: action dimension; index: position in the batch
-    environment = 7,        // step: episode; index: draw within the reset
-    projection = 8,         // step: 0; index: element of the random projection
-    data_set = 9,           // step: trajectory; index: time-step
+    initialisation = 1,  // step: tensor number; index: element
+    dropout = 2,  // step: update; site: place in the network + 2^20 times the part of the batch; index: element / 4,
+                  // counted row by row; attention weights count as [query, head, longest sequence of the part]
+    batch = 3,    // step: update; index: window of the batch
+    exploration = 4,        // step: episode; site: action dimension; index: time-step
+    remembered_action = 5,  // eq. (6). step: update; index: window * context_length + step within the window
+    entropy_noise = 6,      // the same; site: action dimension
+    environment = 7,  // step: episode (evaluations count from 2^40, data sets from 2^41); index: draw in the reset
+    projection = 8,   // step: 0; index: element of the random projection
+    data_set = 9,     // step: trajectory; index: time-step
 };
 
 struct Random {
@@ -1066,8 +1067,6 @@ struct Transformer {
         embed_return = linear_layer("embed_return", 1, d, Init::uniform_fan_in, seed);
         embed_state = linear_layer("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
         embed_action = linear_layer("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);
-        if (c.max_timesteps > 0)
-            embed_ordering = add("embed_ordering.weight", {c.max_timesteps, d}, Init::normal_1, 0, seed);
         embed_ln = norm("embed_ln", seed);
         for (int layer = 0; layer < c.layers; ++layer) {
             const std::string h = "transformer.h." + std::to_string(layer) + ".";
@@ -1089,6 +1088,9 @@ struct Transformer {
         } else {
             predict_mean = linear_layer("predict_action.0", d, c.action_dim, Init::uniform_fan_in, seed);
         }
+        // Last, so that having it moves no other tensor's random numbers.
+        if (c.max_timesteps > 0)
+            embed_ordering = add("embed_ordering.weight", {c.max_timesteps, d}, Init::normal_1, 0, seed);
     }
     Transformer(const Transformer&) = delete;
     Transformer& operator=(const Transformer&) = delete;
@@ -1440,7 +1442,7 @@ Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
 
 struct OptimizerConfig {
     enum class Rule { lamb, adamw } rule = Rule::lamb;
-    double learning_rate = 1e-3, beta1 = 0.9, beta2 = 0.999, epsilon = 1e-8, weight_decay = 0;
+    double learning_rate = 1e-3, beta1 = 0.9, beta2 = 0.999, epsilon = 1e-8, weight_decay = 0;  // betas, epsilon: ODT's
     bool always_adapt = false;  // LAMB's trust ratio also without weight decay
     double clip_norm = 0.25;    // of the gradient over all tensors; 0: no clipping
     uint64_t warmup_updates = 10000;

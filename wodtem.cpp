@@ -1,6 +1,6 @@
 // wodtem.cpp: weighting online decision transformer with episodic memory: the method, and the command line around it.
 //
-// In order: settings (Tables I and II, each value with its source); the agent and all training state; batches and the
+// In order: settings (Tables I and II and the per-dataset table, each value with its source); the agent and all training state; batches and the
 // memory's advice, eqs. (4) to (7); the objective and its two steps, eqs. (1) to (3) and (8) to (10); acting and
 // evaluation, sec. III-B; the offline and the online phase, sec. IV-B.3; the run folder; commands; main.
 // One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and
@@ -27,13 +27,14 @@
 #include "nn.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Settings. The initial values are the paper's grid world; `rows` below gives each one's range and source.
+// Settings. The initial values are the paper's grid world, and `setting_rows` gives each one's range and
+// source; `task_rows` says what the other tasks change.
 
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
     int64_t seed = 0;
 
-    int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 1;
+    int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
     bool position = false;
     double dropout = 0.1;
 
@@ -69,19 +70,23 @@ struct SettingRow {
     const char* source;   // of the grid world's value
 };
 
+constexpr const char* task_names =
+    "gridworld|hopper-medium-v2|hopper-medium-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|"
+    "halfcheetah-medium-v2|halfcheetah-medium-replay-v2|ant-medium-v2|ant-medium-replay-v2|antmaze-umaze-v2|"
+    "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1";
 constexpr double many = 1e9;
 inline const SettingRow setting_rows[] = {
-    {"task", &Settings::task, 0, 0, "gridworld", "command line"},
+    {"task", &Settings::task, 0, 0, task_names, "command line"},
     {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
     {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
     {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
     {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
-    // The network. WODTEM Table I (rows 1 to 3, 9); the rest as in ODT's code.
+    // The network.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
     {"width", &Settings::width, 8, 65536, "", "WODTEM Table I: embedding dimension"},
     {"context_length", &Settings::context_length, 1, 1000, "", "WODTEM Table I: context length C"},
-    {"eval_context", &Settings::eval_context, 1, 1000, "", "ODT's code: 5, here no longer than context_length"},
+    {"eval_context", &Settings::eval_context, 1, 1000, "", "ODT's code; never more than context_length"},
     {"position", &Settings::position, 0, 0, "", "WODTEM Table I: position"},
     {"dropout", &Settings::dropout, 0, 0.99, "", "ODT's code"},
     // Optimisation of theta.
@@ -131,6 +136,88 @@ inline const SettingRow setting_rows[] = {
      "chosen: gives mean length 47.50 and return 0.91, sec. IV-A"},
 };
 
+// What the D4RL tasks change, later rows over earlier ones. `task`: how its name begins ("" is all of them); `method`:
+// "" is all. "unverified" and "one public reproduction" are what they say: ODT's paper gives no such table we could read.
+struct TaskRow {
+    const char *task, *method, *name, *value, *source;
+};
+inline const TaskRow task_rows[] = {
+    {"", "", "layers", "4", "ODT's code"},
+    {"", "", "heads", "4", "ODT's code"},
+    {"", "", "width", "512", "ODT's code"},
+    {"", "", "context_length", "20", "ODT's code"},
+    {"", "", "updates_per_iteration", "300", "ODT's code"},
+    {"", "", "buffer_size", "1000", "ODT's code"},
+    {"", "", "eval_episodes", "10", "ODT's code"},
+    {"", "", "reward_scale", "0.001", "ODT's code"},
+    {"", "", "learning_rate", "1e-4", "ODT's code"},
+    {"", "", "weight_decay", "5e-4", "ODT's code"},
+    {"", "", "offline_updates", "5000", "ODT's code"},
+    {"", "", "online_steps", "200000", "WODTEM sec. V-C"},
+    {"", "", "projected_dim", "4", "WODTEM sec. V-C"},
+    {"", "", "table_size", "2e6", "WODTEM sec. V-C"},
+    {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
+    {"", "", "K", "2", "WODTEM sec. V-C"},
+    {"hopper", "", "g_eval", "3600", "ODT's code"},
+    {"hopper", "", "g_online", "7200", "ODT's code"},
+    {"hopper", "", "eta", "-3", "ODT's code: minus the action dimensions"},
+    {"hopper-medium-replay", "", "learning_rate", "2e-3", "one public reproduction of ODT"},
+    {"hopper-medium-replay", "", "weight_decay", "1e-4", "one public reproduction of ODT"},
+    {"walker2d", "", "learning_rate", "1e-3", "public reproductions of ODT agree"},
+    {"walker2d", "", "weight_decay", "1e-3", "public reproductions of ODT agree"},
+    {"walker2d", "", "offline_updates", "10000", "public reproductions of ODT agree"},
+    {"walker2d", "", "g_eval", "5000", "public reproductions of ODT agree"},
+    {"walker2d", "", "g_online", "10000", "public reproductions of ODT agree"},
+    {"walker2d", "", "eta", "-6", "ODT's code: minus the action dimensions"},
+    {"walker2d", "", "epsilon", "0.2", "WODTEM sec. V-C"},
+    {"halfcheetah", "", "g_eval", "6000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "g_online", "12000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "eta", "-6", "ODT's code: minus the action dimensions"},
+    {"halfcheetah", "", "epsilon", "0.6", "WODTEM sec. V-C"},
+    {"ant-", "", "g_eval", "6000", "unverified"},
+    {"ant-", "", "g_online", "12000", "unverified"},
+    {"ant", "", "eta", "-8", "ODT's code: minus the action dimensions"},
+    {"ant", "", "epsilon", "0.3", "WODTEM sec. V-C"},
+    {"antmaze", "", "width", "1024", "one public reproduction of ODT"},
+    {"antmaze", "", "learning_rate", "1e-3", "one public reproduction of ODT"},
+    {"antmaze", "", "weight_decay", "0", "one public reproduction of ODT"},
+    {"antmaze", "", "offline_updates", "7000", "one public reproduction of ODT"},
+    {"antmaze", "", "buffer_size", "1500", "one public reproduction of ODT"},
+    {"antmaze", "", "position", "yes", "one public reproduction of ODT"},
+    {"antmaze", "", "g_eval", "1", "one public reproduction of ODT"},
+    {"antmaze", "", "g_online", "2", "one public reproduction of ODT"},
+    {"antmaze", "", "reward_scale", "1", "ODT's code"},
+    {"maze2d", "", "layers", "4", "WODTEM Table II"},
+    {"maze2d", "", "heads", "4", "WODTEM Table II"},
+    {"maze2d", "", "width", "512", "WODTEM Table II"},
+    {"maze2d", "", "context_length", "20", "WODTEM Table II"},
+    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II"},
+    {"maze2d", "", "weight_decay", "0", "WODTEM Table II"},
+    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II"},
+    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II"},
+    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II"},
+    {"maze2d", "", "position", "yes", "WODTEM Table II"},
+    {"maze2d", "", "eta", "-2", "ODT's code: minus the action dimensions"},
+    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II"},
+    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II"},
+    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II"},
+    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II"},
+    {"maze2d-large", "", "g_online", "560", "WODTEM Table II"},
+    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II"},
+    {"maze2d-large", "", "table_size", "4e6", "WODTEM sec. V-C"},
+    {"", "dt", "layers", "3", "DT's code"},
+    {"", "dt", "heads", "1", "DT's code"},
+    {"", "dt", "width", "128", "DT's code"},
+    {"", "dt", "eval_context", "20", "DT's code"},
+    {"", "dt", "batch_size", "64", "DT's code"},
+    {"", "dt", "optimizer", "adamw", "DT's code"},
+    {"", "dt", "learning_rate", "1e-4", "DT's code"},
+    {"", "dt", "weight_decay", "1e-4", "DT's code"},
+    {"", "dt", "offline_updates", "100000", "DT's code"},
+    {"", "dt", "position", "yes", "DT's code"},
+    {"maze2d", "dt", "reward_scale", "1", "chosen: as others' DT on maze2d"},
+};
+
 // The number of single-letter changes from one word to the other (Levenshtein), for "did you mean".
 int edit_distance(const std::string& a, const std::string& b) {
     std::vector<int> row(b.size() + 1);
@@ -161,6 +248,12 @@ std::vector<std::string> split(const std::string& text, char separator) {
 
 // Shortest text that reads back as the same number.
 std::string number_text(double x) {
+    char text[32];
+    const auto end = std::to_chars(text, text + sizeof text, x).ptr;
+    return {text, end};
+}
+
+std::string number_text(float x) {
     char text[32];
     const auto end = std::to_chars(text, text + sizeof text, x).ptr;
     return {text, end};
@@ -232,30 +325,48 @@ void set_from(Settings& settings, const std::string& name, const std::string& te
     settings.source[name] = source;
 }
 
+// A task's full name; the version may be left off.
+std::string full_task_name(const std::string& name) {
+    for (const std::string& task : split(task_names, '|'))
+        if (task.starts_with(name + "-v") && task.size() == name.size() + 3) return task;
+    return name;
+}
+
 Settings default_settings(const std::string& task, const std::string& method, const std::string& preset) {
     Settings settings;
-    set_setting(settings, "task", task);
+    set_setting(settings, "task", full_task_name(task));
     set_setting(settings, "method", method);
     set_setting(settings, "preset", preset);
+    const bool gridworld = settings.task == "gridworld";
+    for (const TaskRow& row : task_rows)
+        if (!gridworld && settings.task.starts_with(row.task) && (*row.method == 0 || method == row.method))
+            set_from(settings, row.name, row.value, row.source);
     if (preset == "small") set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (method == "dt") {
         set_from(settings, "online_steps", "0", "DT learns offline only");
-        set_from(settings, "initial_lambda", "1e-9", "DT has no entropy term: lambda is not used");
+        for (const char* name : {"layers", "heads", "width", "context_length", "learning_rate", "weight_decay",
+                                 "offline_updates", "position"})
+            if (gridworld && !settings.source.contains(name))
+                settings.source[name] = "chosen for DT: as ODT's in Table I, so that only the objective differs";
     }
     return settings;
 }
 
 void check_together(const Settings& settings) {
-    if (settings.width % settings.heads != 0)
-        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld",
-             static_cast<long long>(settings.width), static_cast<long long>(settings.heads),
-             static_cast<long long>((settings.width / settings.heads + 1) * settings.heads));
-    if (settings.eval_context > settings.context_length)
-        fail("usage.setting", "eval_context %lld is longer than the context_length %lld that is trained",
-             static_cast<long long>(settings.eval_context), static_cast<long long>(settings.context_length));
+    const long long width = settings.width, heads = settings.heads;
+    if (width % heads != 0)
+        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", width, heads,
+             (width / heads + 1) * heads);
+    if (settings.batch_size * settings.context_length > 1000000)
+        fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
+             static_cast<long long>(settings.batch_size), static_cast<long long>(settings.context_length));
     if (settings.online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
              static_cast<long long>(settings.online_steps));
+    if (settings.task != "gridworld")
+        fail("usage.task",
+             "the settings of %s are known, but its environment is not part of this version; gridworld can be trained",
+             settings.task.c_str());
 }
 
 // name = value    # source
@@ -270,10 +381,36 @@ std::string settings_text(const Settings& settings) {
     return text;
 }
 
+// Errors name the file: settings.value, settings.missing.
 Settings settings_from_text(const std::string& text, const std::string& path) {
     Settings settings;
-    for (const auto& [name, value, source] : parse_settings(text, path)) set_from(settings, name, value, source);
+    std::set<std::string> found;
+    for (const auto& [name, value, source] : parse_settings(text, path)) {
+        try {
+            set_from(settings, name, value, source);
+        } catch (const Error& error) {
+            fail("settings.value", "%s: %s; is it damaged, or from another version?", path.c_str(), error.what());
+        }
+        found.insert(name);
+    }
+    for (const SettingRow& row : setting_rows)
+        if (!found.contains(row.name))
+            fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
+                 row.name);
     return settings;
+}
+
+// Errors: run.other_settings. `where`: the file or folder that belongs to `found`.
+void require_same_settings(const Settings& found, const Settings& wanted, const std::string& where) {
+    for (const SettingRow& row : setting_rows) {
+        const std::string was = setting_text(found, row), now = setting_text(wanted, row);
+        if (was == now) continue;
+        const bool kernel = std::string(row.name) == "arithmetic";
+        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
+             row.name, was.c_str(), now.c_str(),
+             kernel ? "choose the kernel it was begun with (--kernel)"
+                    : "choose another folder with --out, or the same settings");
+    }
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -574,12 +711,12 @@ template <class T>
 Tensor<T> log_prob(Tape<T>& tape, Head head, const Policy<T>& policy, const float* actions) {
     if (head == Head::categorical) return categorical_log_prob(tape, policy.mean, actions);
     if (head == Head::squashed_gaussian) return gaussian_log_prob(tape, policy, actions);
-    const Tensor<T> error = squared_error(tape, policy.mean, actions), none = tape.make(error.rows, 1);
-    for (int i = 0; i < error.rows; ++i) none.value[i] = -error.value[i];
+    const Tensor<T> error = squared_error(tape, policy.mean, actions), negative = tape.make(error.rows, 1);
+    for (int i = 0; i < error.rows; ++i) negative.value[i] = -error.value[i];
     tape.on_backward([=] {
-        for (int i = 0; i < error.rows; ++i) error.gradient[i] -= none.gradient[i];
+        for (int i = 0; i < error.rows; ++i) error.gradient[i] -= negative.gradient[i];
     });
-    return none;
+    return negative;
 }
 
 // H(pi_theta(. | s^c, g^c)), [n, 1]: exact where the policy is categorical, else by one sample with the given noise.
@@ -591,9 +728,9 @@ Tensor<T> policy_entropy(Tape<T>& tape, Head head, const Policy<T>& policy, cons
 
 template <class T>
 struct Objective {
-    Tensor<T> likelihood;  // L(theta), or J(theta) where all w = 1
-    Tensor<T> entropy;     // H-bar(theta)
-    Tensor<T> loss;        // what theta descends
+    Tensor<T> L;           // L(theta), or J(theta) where all w = 1
+    Tensor<T> H;           // H-bar(theta)
+    Tensor<T> lagrangian;  // what theta descends
 };
 
 // Equations (2), (3), (8) to (10) for one batch. `entropy_noise` [n, action_dim]: for the Gaussian head only.
@@ -610,18 +747,18 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
     // WODTEM eq. (2): J is L with w = 1. Both terms read one distribution; the action tokens stay the buffer's.
     // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over all steps.
-    result.likelihood =
+    result.L =
         combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()),
                 T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
     if (!constrain_entropy) {
-        result.loss = result.likelihood;
+        result.lagrangian = result.L;
         return result;
     }
     // WODTEM eq. (3), WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
     // departs from ODT's code: over real steps only; ODT's code lets padding into this mean.
-    result.entropy = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), batch.mean.data());
+    result.H = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), batch.mean.data());
     // WODTEM eq. (1), WODTEM eq. (8): theta descends L + lambda (eta - H-bar); lambda eta does not depend on theta.
-    result.loss = combine(tape, T(1), result.likelihood, T(-lambda), result.entropy);
+    result.lagrangian = combine(tape, T(1), result.L, T(-lambda), result.H);
     return result;
 }
 
@@ -640,7 +777,7 @@ void update_lambda(Run& run, double entropy) {
 // A part of the batch: its share of the objective, forward and backward; parts run side by side.
 struct Part {
     Batch batch;
-    double likelihood = 0, entropy = 0;
+    double loss = 0, entropy = 0;  // its share of L and H-bar
     std::exception_ptr problem;
 };
 
@@ -666,9 +803,9 @@ void learn_part(Run& run, Part& part, uint32_t number) {
     const Policy<float> policy = forward(tape, run.agent.model, part.batch.sequences, Ask::every_state);
     const Objective<float> result =
         objective(tape, head, policy, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
-    tape.backward(result.loss);
-    part.likelihood = result.likelihood.value[0];
-    if (run.constrains_entropy()) part.entropy = result.entropy.value[0];
+    tape.backward(result.lagrangian);
+    part.loss = result.L.value[0];
+    if (run.constrains_entropy()) part.entropy = result.H.value[0];
 }
 
 // One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
@@ -683,18 +820,18 @@ void update(Run& run) {
             part.problem = std::current_exception();
         }
     });
-    double likelihood = 0, entropy = 0;
+    double loss = 0, entropy = 0;
     for (const Part& part : parts) {
         if (part.problem) std::rethrow_exception(part.problem);
         count_consultation(run, part.batch);
-        likelihood += part.likelihood;
+        loss += part.loss;
         entropy += part.entropy;
     }
-    if (!std::isfinite(likelihood + entropy)) fail("nn.not_finite", "the loss is not finite");
+    if (!std::isfinite(loss + entropy)) fail("nn.not_finite", "the loss is not finite");
     run.progress.gradient_norm +=
         update_parameters(run.compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
     if (run.constrains_entropy()) update_lambda(run, entropy);
-    run.progress.loss += likelihood;
+    run.progress.loss += loss;
     run.progress.entropy += entropy;
     run.progress.summed_updates += 1;
     run.progress.updates += 1;
@@ -743,11 +880,11 @@ struct Episode {
 // The latest `context` steps of every episode that goes on, the present state last.
 SequenceBatch acting_batch(const Agent& agent, const std::vector<Episode>& episodes) {
     const size_t S = static_cast<size_t>(agent.spec.state_dim), A = static_cast<size_t>(agent.spec.action_dim);
+    const int context = static_cast<int>(std::min(agent.settings.eval_context, agent.settings.context_length));
     SequenceBatch batch;
     for (const Episode& episode : episodes) {
         if (episode.over) continue;
-        const int t = episode.trajectory.length(),
-                  first = std::max(0, t + 1 - static_cast<int>(agent.settings.eval_context));
+        const int t = episode.trajectory.length(), first = std::max(0, t + 1 - context);
         batch.lengths.push_back(t + 1 - first);
         for (int c = first; c <= t; ++c) {
             const size_t step = static_cast<size_t>(c);
@@ -915,14 +1052,29 @@ void save_checkpoint(Run& run, const RunFolder& folder) {
 void load_checkpoint(Run& run, const RunFolder& folder) {
     const std::string path = folder.file("checkpoint.safetensors");
     const TensorFile file = read_safetensors(path);
+    if (file.text("format") != "wodtem checkpoint 1")
+        fail("checkpoint.format", "%s is no checkpoint of `wodtem train`; remove it to start this run anew",
+             path.c_str());
+    require_same_settings(settings_from_text(file.text("settings"), path), run.agent.settings, path);
     try {
         Loader loader{file};
         visit_state(loader, run);
     } catch (const Error& error) {
         fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
     }
-    truncate_file(folder.file("progress.csv"), run.progress.progress_bytes);
-    truncate_file(folder.file("episodes.csv"), run.progress.episodes_bytes);
+    const std::pair<const char*, uint64_t> logs[] = {{"progress.csv", run.progress.progress_bytes},
+                                                     {"episodes.csv", run.progress.episodes_bytes}};
+    for (const auto& [name, bytes] : logs)  // both are long enough, or neither is touched
+        if (!fs::exists(folder.file(name)) || fs::file_size(folder.file(name)) < bytes)
+            fail(
+                "run.log",
+                "%s is missing or shorter than the %llu bytes it had at the checkpoint; restore it, or remove the folder to start anew",
+                folder.file(name).c_str(), static_cast<unsigned long long>(bytes));
+    for (const auto& [name, bytes] : logs) truncate_file(folder.file(name), bytes);
+}
+
+void remove_checkpoint(const RunFolder& folder) {
+    for (const char* name : {"checkpoint.safetensors", "checkpoint.safetensors.tmp"}) fs::remove(folder.file(name));
 }
 
 // Weights under ODT's names, the temperature, the normaliser and the settings: all that `eval` needs.
@@ -946,10 +1098,15 @@ void load_model(Run& run, const TensorFile& file) {
         file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
     const uint64_t S = static_cast<uint64_t>(run.agent.spec.state_dim);
     run.agent.normaliser = {file.get<float>("state_mean", {S}), file.get<float>("state_std", {S})};
+    const auto require = [&](bool holds, const std::string& name, const char* what) {
+        if (!holds)
+            fail("model.value", "%s: tensor %s holds a number that is not %s", file.path.c_str(), name.c_str(), what);
+    };
     for (const Parameter<float>& parameter : run.agent.model.parameters)
-        for (const float value : parameter.value)
-            if (!std::isfinite(value))
-                fail("model.not_finite", "%s: tensor %s is not finite", file.path.c_str(), parameter.name.c_str());
+        for (const float value : parameter.value) require(std::isfinite(value), parameter.name, "finite");
+    for (const float value : run.agent.normaliser.mean) require(std::isfinite(value), "state_mean", "finite");
+    for (const float value : run.agent.normaliser.deviation)
+        require(std::isfinite(value) && value > 0, "state_std", "finite and positive");
 }
 
 std::string csv_line(const std::vector<std::string>& fields) {
@@ -1031,6 +1188,7 @@ struct Console {
     uint64_t first_update = 0;
 };
 
+// The one global: a signal handler has nothing else. Set, it makes the run save a checkpoint and end.
 volatile std::sig_atomic_t stop_requested = 0;
 
 // What a phase needs besides the state: where to write, and whom to tell.
@@ -1082,16 +1240,17 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
         run.agent.settings.learning_rate *
         warmup_factor(std::max<uint64_t>(1, p.updates) - 1, static_cast<uint64_t>(run.agent.settings.warmup_updates));
     const auto mean = [](double sum, double count) {
-        return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");
+        return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");  // seven digits will do
     };
-    const std::string line = csv_line(
-        {p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions),
-         std::to_string(p.episodes), number_text(learning_rate), mean(p.loss, p.summed_updates),
-         mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
-         number_text(run.constrains_entropy() ? static_cast<double>(run.temperature.lambda()) : 0.0),
-         mean(p.gradient_norm, p.summed_updates), mean(p.short_pairs, p.pairs), mean(p.unmatched_pairs, p.pairs),
-         std::to_string(run.memory.size()), number_text(p.eval_length), number_text(p.eval_return),
-         number_text(p.eval_return), mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
+    const std::string line =
+        csv_line({p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions),
+                  std::to_string(p.episodes), number_text(learning_rate), mean(p.loss, p.summed_updates),
+                  mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
+                  run.constrains_entropy() ? number_text(run.temperature.lambda()) : "nan",
+                  mean(p.gradient_norm, p.summed_updates), mean(p.short_pairs, run.remembers() ? p.pairs : 0),
+                  mean(p.unmatched_pairs, run.remembers() ? p.pairs : 0), std::to_string(run.memory.size()),
+                  number_text(p.eval_length), number_text(p.eval_return), number_text(p.eval_return),
+                  mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
     AppendFile(session.folder.file("progress.csv")).append(line);
     p.progress_bytes += line.size();
     p.evaluations += 1;
@@ -1151,13 +1310,17 @@ void online_phase(Run& run, Session<Environment>& session) {
     while (true) {
         const uint64_t owed = static_cast<uint64_t>(settings.offline_updates) +
                               p.episodes * static_cast<uint64_t>(settings.updates_per_iteration);
-        while (p.updates < owed) update_and_watch(run, session);
+        const double share = std::min(1.0, static_cast<double>(p.interactions) / static_cast<double>(budget));
+        while (p.updates < owed) {
+            update_and_watch(run, session);
+            session.console.show(run, "online", std::min(share, 0.999));
+        }
         const bool last = p.interactions >= budget;
         if (p.episodes >= p.next_evaluation || last) evaluate_and_record(run, session);
-        session.console.show(run, "online",
-                             std::min(1.0, static_cast<double>(p.interactions) / static_cast<double>(budget)));
+        if (last) session.console.show(run, "online", 1);
         if (last) return;
         interact(run, session);
+        checkpoint_if_due(run, session);
     }
 }
 
@@ -1268,16 +1431,7 @@ void claim_folder(const Settings& settings, const RunFolder& folder) {
         write_file_atomic(path, settings_text(settings));
         return;
     }
-    const Settings found = settings_from_text(read_file(path, 1 << 20), path);
-    for (const SettingRow& row : setting_rows) {
-        const std::string was = setting_text(found, row), wanted = setting_text(settings, row);
-        if (was == wanted) continue;
-        const bool kernel = std::string(row.name) == "arithmetic";
-        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", folder.path.c_str(),
-             row.name, was.c_str(), wanted.c_str(),
-             kernel ? "choose the kernel it was begun with (--kernel)"
-                    : "choose another folder with --out, or the same settings");
-    }
+    require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
 }
 
 struct TrainOptions {
@@ -1291,6 +1445,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     session.console.label = settings.method + " " + std::to_string(settings.seed);
     claim_folder(settings, session.folder);
     if (fs::exists(session.folder.file("finished"))) {
+        remove_checkpoint(session.folder);
         std::printf("%s is finished already\n", path.c_str());
         return;
     }
@@ -1310,10 +1465,11 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     session.console.first_update = run.progress.updates;
     if (run.progress.online == 0) offline_phase(run, session);
     if (settings.online_steps > 0) online_phase(run, session);
+    for (const char* log : {"progress.csv", "episodes.csv"}) AppendFile(session.folder.file(log)).sync();
     save_model(run, session.folder.file("model.safetensors"));
     save_grid_results(run, session.environment, session.folder);
     write_file_atomic(session.folder.file("finished"), "");
-    fs::remove(session.folder.file("checkpoint.safetensors"));
+    remove_checkpoint(session.folder);
     std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s\n", path.c_str(),
                 static_cast<unsigned long long>(run.progress.updates),
                 static_cast<unsigned long long>(run.progress.interactions),
@@ -1348,7 +1504,7 @@ struct Command {
 
 const Option method_option = {"--method", "NAME", "wodtem", "dt, odt or wodtem"};
 const Option preset_option = {"--preset", "NAME", "small", "paper: Table I as printed; small: a narrower network"};
-const Option seed_option = {"--seed", "N", "0", "seed of everything but the data set"};
+const Option seed_option = {"--seed", "N", "", "seed of everything but the data set; default 0"};
 const Option seeds_option = {"--seeds", "A-B", "", "several seeds, one after the other"};
 const Option set_option = {"--set", "NAME=VALUE", "",
                            "any setting (see `wodtem info` of a run's model); may be repeated"};
@@ -1416,13 +1572,17 @@ std::string default_folder(const Settings& settings) {
 }
 
 void command_train(const Arguments& arguments) {
+    for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int) { stop_requested = 1; });
     TrainOptions options;
     options.kernel = arguments["--kernel"];
     options.threads = thread_count(arguments);
     options.checkpoint_every =
         static_cast<double>(whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400));
     const bool several = !arguments["--seeds"].empty();
-    for (const int64_t seed : seed_list(several ? arguments["--seeds"] : arguments["--seed"])) {
+    if (several && !arguments["--seed"].empty()) fail("usage.option", "--seed and --seeds were both given; choose one");
+    for (const int64_t seed : seed_list(several                       ? arguments["--seeds"]
+                                        : arguments["--seed"].empty() ? "0"
+                                                                      : arguments["--seed"])) {
         const Settings settings = asked_settings(arguments, seed);
         std::string folder = arguments["--out"].empty() ? default_folder(settings) : arguments["--out"];
         if (several && !arguments["--out"].empty()) folder += "/seed-" + std::to_string(seed);
@@ -1476,7 +1636,7 @@ void command_report(const Arguments& arguments) {
 }
 
 // How long an update takes here, times how many there will be: offline_updates, and updates_per_iteration for each
-// episode. The episodes are not known beforehand; those of preset small, seed 0, stand in: 2028 of WODTEM, 531 of ODT.
+// episode. The episodes are not known beforehand; the means of preset small over seeds 0 to 4 stand in (README.md).
 double estimated_seconds(const Settings& settings) {
     Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
     const GridWorld environment = make_environment(settings);
@@ -1486,7 +1646,7 @@ double estimated_seconds(const Settings& settings) {
     const auto begin = Console::Clock::now();
     for (int i = 0; i < 3; ++i) update(run);
     const double update_seconds = Console::seconds_between(begin, Console::Clock::now()) / 3;
-    const double episodes = settings.method == "dt" ? 0 : settings.method == "odt" ? 531 : 2028;
+    const double episodes = settings.method == "dt" ? 0 : settings.method == "odt" ? 498 : 2041;
     return update_seconds * (static_cast<double>(settings.offline_updates) +
                              episodes * static_cast<double>(settings.updates_per_iteration));
 }
@@ -1551,12 +1711,19 @@ void command_info(const Arguments& arguments) {
     }
 }
 
-void command_tasks(const Arguments&) {
-    std::printf("%-12s %-10s %-8s %-8s %s\n", "task", "state", "actions", "steps", "data set");
+void command_tasks(const Arguments& arguments) {
+    if (!arguments.words.empty()) {
+        std::printf("%s", settings_text(default_settings(arguments.words[0], arguments["--method"], "paper")).c_str());
+        return;
+    }
     const EnvironmentSpec spec = GridWorld{}.spec();
     std::printf(
-        "%-12s %-10d %-8d %-8d %d trajectories of a fixed policy, made on the spot (behaviour: right_down, or left_down)\n",
-        "gridworld", spec.state_dim, spec.moves, spec.max_episode_steps, 500);
+        "gridworld: %d state numbers, %d moves, at most %d steps; data set: 500 trajectories of a fixed policy, made on the spot\n",
+        spec.state_dim, spec.moves, spec.max_episode_steps);
+    for (const std::string& task : split(task_names, '|'))
+        if (task != "gridworld")
+            std::printf("%s: settings only (wodtem tasks %s); its environment is not part of this version\n",
+                        task.c_str(), task.c_str());
 }
 
 #include "tests/bench.hpp"
@@ -1622,7 +1789,13 @@ const std::vector<Command>& commands() {
          "the machine's peak, each kernel's share of it, update and look-up times",
          {kernel_option, threads_option},
          command_bench},
-        {"tasks", "", 0, 0, "list tasks and data sets", {}, command_tasks},
+        {"tasks",
+         "[TASK]",
+         0,
+         1,
+         "list tasks, or the settings of one with their sources",
+         {method_option},
+         command_tasks},
     };
     return list;
 }
@@ -1712,7 +1885,6 @@ int run_command_line(const std::vector<std::string>& words) {
 
 #ifndef WODTEM_NO_MAIN
 int main(int argument_count, char** arguments) {
-    for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int) { stop_requested = 1; });
     std::signal(SIGPIPE, SIG_IGN);  // a closed pipe is an error of write, told in a sentence
     std::signal(SIGXFSZ, SIG_IGN);  // and so is a file size limit
     try {

@@ -982,7 +982,7 @@ TEST(parameters_have_the_names_and_shapes_of_odt) {
         "embed_return.weight 64 1\nembed_return.bias "
         "64\nembed_state.weight 64 17\nembed_state.bias 64\n"
         "embed_action.weight 64 6\nembed_action.bias "
-        "64\nembed_ordering.weight 1000 64\n"
+        "64\n"
         "embed_ln.weight 64\nembed_ln.bias 64\n";
     for (const std::string layer : {"0", "1"})
         for (const std::string name :
@@ -993,7 +993,7 @@ TEST(parameters_have_the_names_and_shapes_of_odt) {
     expected +=
         "transformer.ln_f.weight 64\ntransformer.ln_f.bias "
         "64\npredict_action.mu.weight 6 64\npredict_action.mu.bias 6\n"
-        "predict_action.log_std.weight 6 64\npredict_action.log_std.bias 6\n";
+        "predict_action.log_std.weight 6 64\npredict_action.log_std.bias 6\nembed_ordering.weight 1000 64\n";
     CHECK_EQUAL(got, expected);
     const Transformer<float> bare({17, 6, 1, 1, 64, 0, 0, Head::categorical}, 1);
     for (const Parameter<float>& parameter : bare.parameters) CHECK(parameter.name != "embed_ordering.weight");

@@ -146,6 +146,59 @@ TEST(the_paper_preset_is_table_one) {
         CHECK_EQUAL(name + " = " + setting_text(s, setting_row(name)), name + " = " + value);
 }
 
+// WODTEM Table II test, and sec. V-C
+TEST(the_other_tasks_have_table_two_and_the_per_dataset_values) {
+    const auto check = [](const char* task, const std::map<std::string, std::string>& table) {
+        const Settings s = default_settings(task, "wodtem", "paper");
+        for (const auto& [name, value] : table)
+            CHECK_EQUAL(task + (" " + name) + " = " + setting_text(s, setting_row(name)),
+                        task + (" " + name) + " = " + value);
+    };
+    for (const char* task : {"maze2d-umaze-v1", "maze2d-medium-v1", "maze2d-large-v1"})
+        check(task, {{"layers", "4"},
+                     {"heads", "4"},
+                     {"width", "512"},
+                     {"context_length", "20"},
+                     {"weight_decay", "0"},
+                     {"learning_rate", "0.001"},
+                     {"offline_updates", "20000"},
+                     {"updates_per_iteration", "300"},
+                     {"buffer_size", "1500"},
+                     {"position", "yes"},
+                     {"epsilon", "0.1"},
+                     {"projected_dim", "4"},
+                     {"alpha", "0.9"},
+                     {"K", "2"},
+                     {"online_steps", "200000"}});
+    check("maze2d-umaze", {{"g_online", "340"}, {"g_eval", "170"}, {"table_size", "2000000"}, {"eta", "-2"}});
+    check("maze2d-medium", {{"g_online", "560"}, {"g_eval", "280"}, {"table_size", "2000000"}});
+    check("maze2d-large", {{"g_online", "560"}, {"g_eval", "280"}, {"table_size", "4000000"}});
+    check("hopper-medium", {{"learning_rate", "1e-04"},
+                            {"weight_decay", "5e-04"},
+                            {"g_eval", "3600"},
+                            {"g_online", "7200"},
+                            {"epsilon", "0.1"},
+                            {"eta", "-3"}});
+    check("hopper-medium-replay", {{"learning_rate", "0.002"}, {"weight_decay", "1e-04"}, {"offline_updates", "5000"}});
+    check("walker2d-medium", {{"learning_rate", "0.001"},
+                              {"offline_updates", "10000"},
+                              {"epsilon", "0.2"},
+                              {"g_eval", "5000"},
+                              {"eta", "-6"}});
+    check("halfcheetah-medium-replay", {{"epsilon", "0.6"}, {"g_eval", "6000"}, {"g_online", "12000"}});
+    check("ant-medium", {{"epsilon", "0.3"}, {"eta", "-8"}, {"reward_scale", "0.001"}});
+    check("antmaze-umaze-diverse", {{"epsilon", "0.3"},
+                                    {"width", "1024"},
+                                    {"position", "yes"},
+                                    {"reward_scale", "1"},
+                                    {"g_online", "2"},
+                                    {"eta", "-8"}});
+    const Settings dt = default_settings("hopper-medium-v2", "dt", "paper");
+    CHECK(dt.width == 128 && dt.layers == 3 && dt.heads == 1 && dt.batch_size == 64 && dt.optimizer == "adamw" &&
+          dt.eval_context == 20);
+    CHECK_FAILS("usage.task", check_together(default_settings("hopper-medium", "wodtem", "paper")));
+}
+
 TEST(the_small_preset_differs_in_width_alone) {
     const Settings paper = default_settings("gridworld", "odt", "paper"),
                    small = default_settings("gridworld", "odt", "small");
@@ -216,14 +269,14 @@ TEST(objective_is_the_equations_written_out) {
         }
         L += l / steps[window] / 2, J += j / steps[window] / 2, H += h / steps[window] / 2;
     }
-    CHECK_CLOSE(got.likelihood.value[0], L, 1e-6);  // the coefficients 1 / (B |C^t|) are float32
-    CHECK_CLOSE(got.entropy.value[0], H, 1e-6);
-    CHECK_CLOSE(got.loss.value[0], L - static_cast<double>(lambda) * H, 1e-6);
+    CHECK_CLOSE(got.L.value[0], L, 1e-6);  // the coefficients 1 / (B |C^t|) are float32
+    CHECK_CLOSE(got.H.value[0], H, 1e-6);
+    CHECK_CLOSE(got.lagrangian.value[0], L - static_cast<double>(lambda) * H, 1e-6);
     CHECK(std::fabs(L - J) > 1e-3);  // the memory's part is there
 
     Batch plain = batch;
     plain.weights.assign(4, 1.0f);
-    CHECK_CLOSE(objective(tape, Head::categorical, policy, plain, nullptr, lambda, true).likelihood.value[0], J, 1e-6);
+    CHECK_CLOSE(objective(tape, Head::categorical, policy, plain, nullptr, lambda, true).L.value[0], J, 1e-6);
 }
 
 // The whole objective, network included, against central differences, for every head and every parameter.
@@ -239,7 +292,7 @@ TEST(objective_gradient_equals_central_differences) {
         const auto loss = [&] {
             tape.reset();
             const Policy<double> policy = forward(tape, model, batch.sequences, Ask::every_state);
-            return objective(tape, head, policy, batch, noise.data(), 0.3f, head != Head::deterministic).loss;
+            return objective(tape, head, policy, batch, noise.data(), 0.3f, head != Head::deterministic).lagrangian;
         };
         tape.backward(loss());
         double worst = 0, largest = 0;
@@ -557,9 +610,9 @@ TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
 
     write_file_atomic(path, good);
     truncate_file(scratch / "run/episodes.csv", 3);
-    CHECK_FAILS("file.shorter", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    CHECK_FAILS("run.log", quiet_train(tiny_settings("wodtem"), scratch / "run"));
     write_file_atomic(scratch / "run/settings", "width = 8 # half a file");
-    CHECK_FAILS("run.other_settings", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    CHECK_FAILS("settings.missing", quiet_train(tiny_settings("wodtem"), scratch / "run"));
 }
 
 TEST(damaged_models_are_refused) {
@@ -571,7 +624,7 @@ TEST(damaged_models_are_refused) {
     open_model(scratch / "model.safetensors", arguments);
     f.run.agent.model.parameters[3].value[0] = NAN;
     save_model(f.run, scratch / "nan.safetensors");
-    CHECK_FAILS("model.not_finite", open_model(scratch / "nan.safetensors", arguments));
+    CHECK_FAILS("model.value", open_model(scratch / "nan.safetensors", arguments));
     save_checkpoint(f.run, {scratch.path});
     CHECK_FAILS("model.format", open_model(scratch / "checkpoint.safetensors", arguments));
     CHECK_FAILS("file.open", open_model(scratch / "none.safetensors", arguments));
@@ -657,6 +710,8 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --seed -1", 2, "nearest is 0");
     check_shell("./wodtem train gridworld --seed 1 --seed 2", 2, "given twice");
     check_shell("./wodtem train gridworld --seed", 2, "needs a value");
+    check_shell("./wodtem train gridworld --seed 1 --seeds 0-4", 2, "choose one");
+    check_shell("./wodtem train hopper-medium", 2, "not part of this version");
     check_shell("./wodtem train gridworld --set alpha=2", 2, "nearest is 1");
     check_shell("./wodtem train gridworld --set alhpa=1", 2, "nearest is \"alpha\"");
     check_shell("./wodtem train gridworld --set alpha", 2, "NAME=VALUE");
