@@ -503,6 +503,7 @@ struct Progress {
     uint64_t progress_bytes = 0, episodes_bytes = 0;  // of the two logs
     double loss = 0, entropy = 0, gradient_norm = 0, summed_updates = 0;
     double pairs = 0, short_pairs = 0, unmatched_pairs = 0;
+    double matched = 0, evicted = 0;  // states that the table knew already; entries it had to give up
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
     double eval_length = NAN, eval_return = NAN;
 
@@ -526,6 +527,8 @@ struct Progress {
                                                                     {"progress.pairs", pairs},
                                                                     {"progress.short_pairs", short_pairs},
                                                                     {"progress.unmatched_pairs", unmatched_pairs},
+                                                                    {"progress.matched", matched},
+                                                                    {"progress.evicted", evicted},
                                                                     {"progress.rollout_length", rollout_length},
                                                                     {"progress.rollout_return", rollout_return},
                                                                     {"progress.rollouts", rollouts},
@@ -669,7 +672,9 @@ void remember(Run& run, Trajectory trajectory) {
         keys.insert(keys.end(), key.begin(), key.end());
     }
     trajectory.states = std::move(keys);
-    run.memory.update(trajectory);
+    const EpisodicMemory::Changes changes = run.memory.update(trajectory);
+    run.progress.matched += static_cast<double>(changes.improved + changes.kept);
+    run.progress.evicted += static_cast<double>(changes.evicted);
 }
 
 // WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each
@@ -969,7 +974,7 @@ namespace fs = std::filesystem;
 
 constexpr const char* progress_header =
     "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
-    "eval_length,eval_return,eval_score,rollout_length,rollout_return\n";
+    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted\n";
 constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions\n";
 
 struct Saver {
@@ -1250,13 +1255,14 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
                   mean(p.gradient_norm, p.summed_updates), mean(p.short_pairs, run.remembers() ? p.pairs : 0),
                   mean(p.unmatched_pairs, run.remembers() ? p.pairs : 0), std::to_string(run.memory.size()),
                   number_text(p.eval_length), number_text(p.eval_return), number_text(p.eval_return),
-                  mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts)});
+                  mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts), number_text(p.matched),
+                  number_text(p.evicted)});
     AppendFile(session.folder.file("progress.csv")).append(line);
     p.progress_bytes += line.size();
     p.evaluations += 1;
     p.next_evaluation = p.episodes + static_cast<uint64_t>(run.agent.settings.eval_every);
     p.loss = p.entropy = p.gradient_norm = p.summed_updates = p.pairs = p.short_pairs = p.unmatched_pairs = 0;
-    p.rollout_length = p.rollout_return = p.rollouts = 0;
+    p.rollout_length = p.rollout_return = p.rollouts = p.matched = p.evicted = 0;
 }
 
 // WODTEM sec. IV-B.3, Fig. 2: offline training on D_offline. The table has taken in every trajectory of it before.

@@ -281,6 +281,15 @@ inline double final_value(const Run& run, Quantity quantity) {
     return last_until(run.interactions, run.*quantity, 1e15);
 }
 
+// Mean over the last ten evaluations (or all, if there are fewer): one evaluation of a policy that wavers says little.
+inline double last_ten(const Run& run, Quantity quantity) {
+    const std::vector<double>& y = run.*quantity;
+    double sum = 0, count = 0;
+    for (size_t i = y.size(); i-- > 0 && count < 10;)
+        if (!std::isnan(y[i])) sum += y[i], ++count;
+    return count > 0 ? sum / count : none;
+}
+
 constexpr int curve_step = 250;  // interactions
 
 // Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run.
@@ -560,33 +569,35 @@ inline void add_grid(Part& part, const Run& run, const std::string& name) {
 }
 
 inline void add_gridworld(Part& part, const std::vector<Runs>& by_method, const std::string& name) {
-    Table summary{{"Method", "Seeds", "Final length", "Final return", "Ends at 5", "Paper: length"}, {}};
-    Table seeds{{"Run", "State", "Final length", "Final return", "Shortest met", "At 5 from", "Folder"}, {}};
+    Table summary{{"Method", "Seeds", "Final length", "Mean of last 10", "Final return", "Ends at 5", "Paper: length"},
+                  {}};
+    Table seeds{{"Run", "State", "Final length", "Last 10", "Final return", "Shortest met", "At 5 from", "Folder"}, {}};
     std::vector<Runs> online;
     for (const Runs& runs : by_method) {
-        std::vector<double> length, total;
+        std::vector<double> length, ten, total;
         size_t at_five = 0;
         for (const Run* run : runs) {
             length.push_back(final_value(*run, &Run::length)), total.push_back(final_value(*run, &Run::total));
+            ten.push_back(last_ten(*run, &Run::length));
             const double from = kept_from(*run, 5);
             at_five += std::isnan(from) ? 0 : 1;
-            seeds.rows.push_back({who(Runs{run}),
-                                  run->finished ? "finished" : "unfinished, at " + shown(run->so_far, 0),
-                                  shown(length.back(), 2), shown(total.back(), 2), shown(shortest_met(*run), 0),
-                                  run->length.empty() ? "-"
-                                  : std::isnan(from)  ? "never"
-                                                      : shown(from, 0),
-                                  run->folder});
+            seeds.rows.push_back(
+                {who(Runs{run}), run->finished ? "finished" : "unfinished, at " + shown(run->so_far, 0),
+                 shown(length.back(), 2), shown(ten.back(), 2), shown(total.back(), 2), shown(shortest_met(*run), 0),
+                 run->length.empty() ? "-"
+                 : std::isnan(from)  ? "never"
+                                     : shown(from, 0),
+                 run->folder});
         }
         summary.rows.push_back({runs[0]->about_method().label, seed_count(runs), plus_minus(spread_of(length)),
-                                plus_minus(spread_of(total)),
+                                plus_minus(spread_of(ten)), plus_minus(spread_of(total)),
                                 std::to_string(at_five) + " of " + std::to_string(runs.size()),
                                 runs[0]->about_method().paper_length});
         if (!runs[0]->offline_only()) online.push_back(runs);
     }
     part.section.tables = {summary, seeds};
     part.section.paragraphs.push_back(
-        "Final: by the last evaluation of a run; lengths in steps. Shortest met: the shortest online episode that "
+        "Final: by the last evaluation of a run; mean of last 10: over its last ten evaluations; lengths in steps. Shortest met: the shortest online episode that "
         "reached the goal. At 5 from: the online interactions of the first evaluation from which on every one took 5 "
         "steps, the length of the shortest path (0: from the end of offline training on).");
 

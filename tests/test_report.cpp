@@ -187,11 +187,11 @@ TEST(report_states_what_the_folders_hold) {
     const std::string out = temporary.path + "/out", text = report(folders, out);
     const std::string page = read_file(out + "/report.html"), markdown = read_file(out + "/report.md");
     for (const char* row :
-         {"| WODTEM | 3 | 5.00 ± 0.00 | 1.00 ± 0.00 | 3 of 3 | 5 (sec. V-D) |",
-          "| ODT | 2 (1 unfinished) | 53.50 ± 65.76 | 0.50 ± 0.71 | 0 of 2 | about 7 (sec. IV-A) |",
-          "| DT | 1 | 14.00 ± - | 1.00 ± - | 0 of 1 | no number (fig. 4a) |",
-          "| WODTEM seed 2 | finished | 5.00 | 1.00 | 6 | 902 |",
-          "| ODT seed 0 | unfinished, at 500 | 100.00 | 0.00 | 6 | never |",
+         {"| WODTEM | 3 | 5.00 ± 0.00 | 6.33 ± 0.00 | 1.00 ± 0.00 | 3 of 3 | 5 (sec. V-D) |",
+          "| ODT | 2 (1 unfinished) | 53.50 ± 65.76 | 76.75 ± 32.88 | 0.50 ± 0.71 | 0 of 2 | about 7 (sec. IV-A) |",
+          "| DT | 1 | 14.00 ± - | 14.00 ± - | 1.00 ± - | 0 of 1 | no number (fig. 4a) |",
+          "| WODTEM seed 2 | finished | 5.00 | 6.33 | 1.00 | 6 | 902 |",
+          "| ODT seed 0 | unfinished, at 500 | 100.00 | 100.00 | 0.00 | 6 | never |",
           "| wodtem train gridworld --method wodtem --preset paper --seeds 0-2 --set alpha=0.5 | plain |",
           "| wodtem train gridworld --method odt --preset paper --seed 4 | plain |"})
         if (markdown.find(row) == std::string::npos) CHECK_EQUAL(row, "is not in " + markdown);
@@ -218,7 +218,7 @@ TEST(report_of_a_run_that_has_just_begun_has_dashes) {
           "task = gridworld # a\nmethod = odt # a\npreset = small # a\nseed = 3 # a\narithmetic = fused # a\n");
     report({temporary.path + "/run/"}, temporary.path + "/out");
     const std::string markdown = read_file(temporary.path + "/out/report.md");
-    CHECK(markdown.find("| ODT | 1 (1 unfinished) | - | - | 0 of 1 |") != std::string::npos);
+    CHECK(markdown.find("| ODT | 1 (1 unfinished) | - | - | - | 0 of 1 |") != std::string::npos);
     CHECK(markdown.find("| ODT seed 3 | unfinished, at 0 | - | - | - | - |") != std::string::npos);
 }
 
