@@ -20,6 +20,7 @@
 #include <new>
 #include <stdexcept>
 #include <string>
+#include <system_error>
 #include <thread>
 #include <type_traits>
 #include <vector>
@@ -119,15 +120,16 @@ struct Random {
 class Threads {
   public:
     // `count` >= 1 threads in all, the calling one among them.
+    // Errors: nn.threads if the system refuses one.
     explicit Threads(int count) {
-        for (int worker = 1; worker < count; ++worker) workers_.emplace_back([this, worker] { work(worker); });
+        try {
+            for (int worker = 1; worker < count; ++worker) workers_.emplace_back([this, worker] { work(worker); });
+        } catch (const std::system_error& error) {
+            stop();
+            fail("nn.threads", "cannot start %d threads: %s; use fewer (--threads)", count, error.what());
+        }
     }
-    ~Threads() {
-        stop_.store(true, std::memory_order_relaxed);
-        ticket_.fetch_add(uint64_t{1} << 32, std::memory_order_release);
-        ticket_.notify_all();
-        for (std::thread& worker : workers_) worker.join();
-    }
+    ~Threads() { stop(); }
     Threads(const Threads&) = delete;
     Threads& operator=(const Threads&) = delete;
 
@@ -180,6 +182,13 @@ class Threads {
             unfinished_.fetch_sub(1, std::memory_order_release);
             ticket = ticket_.load(std::memory_order_acquire);
         }
+    }
+
+    void stop() {
+        stop_.store(true, std::memory_order_relaxed);
+        ticket_.fetch_add(uint64_t{1} << 32, std::memory_order_release);
+        ticket_.notify_all();
+        for (std::thread& worker : workers_) worker.join();
     }
 
     // Spins a little between jobs (they follow each other within microseconds), then sleeps.

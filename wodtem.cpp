@@ -7,6 +7,7 @@
 // the online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit. Promises: a run is a function of
 // its settings: the same bytes for any number of threads, in one go or continued.
 
+#include <sys/file.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
@@ -500,7 +501,7 @@ struct Temperature {
 // How far a run is, and the sums behind the next row of progress.csv.
 struct Progress {
     uint64_t updates = 0, interactions = 0, episodes = 0, online = 0, evaluations = 0, next_evaluation = 0;
-    uint64_t progress_bytes = 0, episodes_bytes = 0;  // of the two logs
+    uint64_t progress_bytes = 0, episodes_bytes = 0, progress_crc = 0, episodes_crc = 0;  // of the two logs
     double loss = 0, entropy = 0, gradient_norm = 0, summed_updates = 0;
     double pairs = 0, short_pairs = 0, unmatched_pairs = 0;
     double matched = 0, evicted = 0;  // states that the table knew already; entries it had to give up
@@ -517,7 +518,9 @@ struct Progress {
                                                                       {"progress.evaluations", evaluations},
                                                                       {"progress.next_evaluation", next_evaluation},
                                                                       {"progress.progress_bytes", progress_bytes},
-                                                                      {"progress.episodes_bytes", episodes_bytes}})
+                                                                      {"progress.episodes_bytes", episodes_bytes},
+                                                                      {"progress.progress_crc", progress_crc},
+                                                                      {"progress.episodes_crc", episodes_crc}})
             archive(name, field);
         for (auto [name, field] :
              std::initializer_list<std::pair<const char*, double&>>{{"progress.loss", loss},
@@ -832,10 +835,12 @@ void update(Run& run) {
         loss += part.loss;
         entropy += part.entropy;
     }
-    if (!std::isfinite(loss + entropy)) fail("nn.not_finite", "the loss is not finite");
+    if (!std::isfinite(loss + entropy))
+        fail("nn.not_finite", "the loss (%g) or the entropy (%g) is not finite", loss, entropy);
     run.progress.gradient_norm +=
         update_parameters(run.compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
     if (run.constrains_entropy()) update_lambda(run, entropy);
+    if (!std::isfinite(run.temperature.lambda())) fail("nn.not_finite", "lambda is not finite");
     run.progress.loss += loss;
     run.progress.entropy += entropy;
     run.progress.summed_updates += 1;
@@ -961,9 +966,11 @@ Evaluation evaluate(Run& run, const Environment& environment, uint64_t number, i
     const uint64_t first = evaluation_episodes + number * static_cast<uint64_t>(count);
     result.episodes = rollout(run, environment, Act::most_likely, run.agent.settings.g_eval, first, count);
     for (const Trajectory& episode : result.episodes) {
-        result.mean_length += episode.length() / static_cast<double>(count);
-        result.mean_return += total_return(episode) / count;
+        result.mean_length += episode.length();
+        result.mean_return += total_return(episode);
     }
+    result.mean_length /= count;  // once: whole lengths give exact means
+    result.mean_return /= count;
     return result;
 }
 
@@ -1056,26 +1063,38 @@ void save_checkpoint(Run& run, const RunFolder& folder) {
 // Errors name the file: a checkpoint may be damaged, or belong to another program's idea of a run.
 void load_checkpoint(Run& run, const RunFolder& folder) {
     const std::string path = folder.file("checkpoint.safetensors");
-    const TensorFile file = read_safetensors(path);
-    if (file.text("format") != "wodtem checkpoint 1")
-        fail("checkpoint.format", "%s is no checkpoint of `wodtem train`; remove it to start this run anew",
-             path.c_str());
-    require_same_settings(settings_from_text(file.text("settings"), path), run.agent.settings, path);
     try {
+        const TensorFile file = read_safetensors(path);
+        if (file.text("format") != "wodtem checkpoint 1")
+            fail("checkpoint.format", "it is no checkpoint of `wodtem train`");
+        require_same_settings(settings_from_text(file.text("settings"), path), run.agent.settings, path);
         Loader loader{file};
         visit_state(loader, run);
     } catch (const Error& error) {
         fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
     }
-    const std::pair<const char*, uint64_t> logs[] = {{"progress.csv", run.progress.progress_bytes},
-                                                     {"episodes.csv", run.progress.episodes_bytes}};
-    for (const auto& [name, bytes] : logs)  // both are long enough, or neither is touched
-        if (!fs::exists(folder.file(name)) || fs::file_size(folder.file(name)) < bytes)
-            fail(
-                "run.log",
-                "%s is missing or shorter than the %llu bytes it had at the checkpoint; restore it, or remove the folder to start anew",
-                folder.file(name).c_str(), static_cast<unsigned long long>(bytes));
-    for (const auto& [name, bytes] : logs) truncate_file(folder.file(name), bytes);
+    struct Log {
+        std::string path;
+        uint64_t bytes, crc;
+    };
+    const Progress& p = run.progress;
+    const Log logs[] = {{folder.file("progress.csv"), p.progress_bytes, p.progress_crc},
+                        {folder.file("episodes.csv"), p.episodes_bytes, p.episodes_crc}};
+    for (const Log& log : logs) {  // both are as they were, or neither is touched
+        const std::string text = fs::exists(log.path) ? read_file(log.path) : "";
+        if (text.size() < log.bytes || crc32(std::string_view(text).substr(0, log.bytes)) != log.crc)
+            fail("run.log",
+                 "%s is not what it was at the checkpoint (%llu bytes); restore it, or remove the folder to start anew",
+                 log.path.c_str(), static_cast<unsigned long long>(log.bytes));
+    }
+    for (const Log& log : logs) truncate_file(log.path, log.bytes);
+}
+
+// Adds a line to a log, and to what the checkpoint will know of it.
+void append_line(const std::string& path, const std::string& line, uint64_t& bytes, uint64_t& crc) {
+    AppendFile(path).append(line);
+    bytes += line.size();
+    crc = crc32(line, static_cast<uint32_t>(crc));
 }
 
 void remove_checkpoint(const RunFolder& folder) {
@@ -1143,11 +1162,12 @@ struct Console {
         if (terminal ? seconds_between(shown, now) < 0.1 && share < 1 : new_tenth == tenth) return;
         shown = now;
         tenth = new_tenth;
-        std::string text = label + " " + phase + " " + bar(share) + numbers(run, now);
+        std::string text = label + " " + phase + " " + bar(share);
         if (share > first_share && share < 1) {
-            const int left = static_cast<int>(seconds_between(started, now) / (share - first_share) * (1 - share));
-            text += ", " + clock_text(left) + " left";
+            const double left = seconds_between(started, now) / (share - first_share) * (1 - share);
+            text += " " + clock_text(static_cast<int>(std::min(left, 3599999.0))) + " left,";
         }
+        text += numbers(run, now);
         if (terminal) text.resize(std::min(text.size(), columns() - 1));  // a line that wraps cannot be drawn over
         std::fprintf(stderr, terminal ? "\r%s\033[K%s" : "%s%s\n", text.c_str(), terminal && share >= 1 ? "\n" : "");
     }
@@ -1257,8 +1277,7 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
                   number_text(p.eval_length), number_text(p.eval_return), number_text(p.eval_return),
                   mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts), number_text(p.matched),
                   number_text(p.evicted)});
-    AppendFile(session.folder.file("progress.csv")).append(line);
-    p.progress_bytes += line.size();
+    append_line(session.folder.file("progress.csv"), line, p.progress_bytes, p.progress_crc);
     p.evaluations += 1;
     p.next_evaluation = p.episodes + static_cast<uint64_t>(run.agent.settings.eval_every);
     p.loss = p.entropy = p.gradient_norm = p.summed_updates = p.pairs = p.short_pairs = p.unmatched_pairs = 0;
@@ -1295,8 +1314,7 @@ void interact(Run& run, Session<Environment>& session) {
     const std::string line =
         csv_line({std::to_string(p.episodes), std::to_string(p.interactions), std::to_string(episode.length()),
                   number_text(total_return(episode)), episode.terminated ? "1" : "0", moves});
-    AppendFile(session.folder.file("episodes.csv")).append(line);
-    p.episodes_bytes += line.size();
+    append_line(session.folder.file("episodes.csv"), line, p.episodes_bytes, p.episodes_crc);
     remember(run, episode);
     run.replay.add(std::move(episode));
 }
@@ -1425,10 +1443,6 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
 
 // A folder may be new, hold this very run, or hold another: then nothing is touched.
 void claim_folder(const Settings& settings, const RunFolder& folder) {
-    std::error_code problem;
-    fs::create_directories(folder.path, problem);
-    if (problem)
-        fail("run.folder", "cannot make the run folder %s: %s", folder.path.c_str(), problem.message().c_str());
     const std::string path = folder.file("settings");
     if (!fs::exists(path)) {
         if (fs::exists(folder.file("progress.csv")) || fs::exists(folder.file("checkpoint.safetensors")))
@@ -1437,8 +1451,24 @@ void claim_folder(const Settings& settings, const RunFolder& folder) {
         write_file_atomic(path, settings_text(settings));
         return;
     }
-    require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
+    const bool begun = fs::exists(folder.file("progress.csv")) || fs::exists(folder.file("checkpoint.safetensors")) ||
+                       fs::exists(folder.file("finished"));
+    if (begun)
+        require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
+    else
+        write_file_atomic(path, settings_text(settings));  // of a start that came to nothing
 }
+
+// One process at a time: the folder itself is locked, and the kernel lets go of it however the process ends.
+struct FolderLock {
+    FileDescriptor folder;
+    explicit FolderLock(const std::string& path) : folder(::open(path.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC)) {
+        if (folder.fd < 0) fail_file("run.folder", "open the run folder", path);
+        if (::flock(folder.fd, LOCK_EX | LOCK_NB) != 0 && errno == EWOULDBLOCK)
+            fail("run.busy", "another process is training in %s; wait for it, or choose another folder with --out",
+                 path.c_str());
+    }
+};
 
 struct TrainOptions {
     std::string kernel = "auto";
@@ -1449,6 +1479,10 @@ struct TrainOptions {
 void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
     Session<GridWorld> session{make_environment(settings), {path}, {}, options.checkpoint_every};
     session.console.label = settings.method + " " + std::to_string(settings.seed);
+    std::error_code problem;
+    fs::create_directories(path, problem);
+    if (problem) fail("run.folder", "cannot make the run folder %s: %s", path.c_str(), problem.message().c_str());
+    const FolderLock lock(path);
     claim_folder(settings, session.folder);
     if (fs::exists(session.folder.file("finished"))) {
         remove_checkpoint(session.folder);
@@ -1463,10 +1497,12 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
                      static_cast<unsigned long long>(run.progress.updates));
     } else {
         begin_run(run, make_data_set(settings, session.environment));
-        write_file_atomic(session.folder.file("progress.csv"), progress_header);
-        write_file_atomic(session.folder.file("episodes.csv"), episodes_header);
-        run.progress.progress_bytes = std::string(progress_header).size();
-        run.progress.episodes_bytes = std::string(episodes_header).size();
+        Progress& p = run.progress;
+        if (fs::exists(session.folder.file("progress.csv")))
+            std::fprintf(stderr, "%s: no checkpoint, starting anew\n", path.c_str());
+        for (const char* log : {"progress.csv", "episodes.csv"}) write_file_atomic(session.folder.file(log), "");
+        append_line(session.folder.file("progress.csv"), progress_header, p.progress_bytes, p.progress_crc);
+        append_line(session.folder.file("episodes.csv"), episodes_header, p.episodes_bytes, p.episodes_crc);
     }
     session.console.first_update = run.progress.updates;
     if (run.progress.online == 0) offline_phase(run, session);
@@ -1533,14 +1569,18 @@ int64_t whole_number(const std::string& text, const char* name, int64_t low, int
 // "3", "0-4" or "1,3,8".
 std::vector<int64_t> seed_list(const std::string& text) {
     std::vector<int64_t> seeds;
-    for (const std::string& part : split(text, ',')) {
+    for (const std::string& part : split(text, ',')) {  // each seed once
         const size_t dash = part.find('-', 1);
         const int64_t first = whole_number(part.substr(0, dash), "a seed", 0, 4294967295);
         const int64_t last =
             dash == std::string::npos ? first : whole_number(part.substr(dash + 1), "a seed", 0, 4294967295);
         if (last < first || last - first > 9999)
             fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", part.c_str());
-        for (int64_t seed = first; seed <= last; ++seed) seeds.push_back(seed);
+        for (int64_t seed = first; seed <= last; ++seed) {
+            if (std::find(seeds.begin(), seeds.end(), seed) != seeds.end())
+                fail("usage.number", "seed %lld is given twice in \"%s\"", static_cast<long long>(seed), text.c_str());
+            seeds.push_back(seed);
+        }
     }
     return seeds;
 }
@@ -1578,7 +1618,12 @@ std::string default_folder(const Settings& settings) {
 }
 
 void command_train(const Arguments& arguments) {
-    for (const int signal : {SIGINT, SIGTERM}) std::signal(signal, [](int) { stop_requested = 1; });
+    for (const int signal : {SIGINT, SIGTERM}) {
+        std::signal(signal, [](int number) {
+            stop_requested = 1;
+            std::signal(number, SIG_DFL);  // a second one ends the process at once
+        });
+    }
     TrainOptions options;
     options.kernel = arguments["--kernel"];
     options.threads = thread_count(arguments);
@@ -1607,13 +1652,20 @@ struct LoadedModel {
     std::unique_ptr<Run> run;
 };
 
-LoadedModel open_model(const std::string& path, const Arguments& arguments) {
+// `given`: a model file, or a run's folder.
+LoadedModel open_model(const std::string& given, const Arguments& arguments) {
+    const std::string path = fs::is_directory(given) ? given + "/model.safetensors" : given;
     const TensorFile file = read_safetensors(path);
     const auto format = file.metadata.find("format");
     if (format == file.metadata.end() || format->second != "wodtem model 1")
         fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
     LoadedModel model;
     model.settings = settings_from_text(file.text("settings"), path);
+    const int64_t weights = 12 * model.settings.layers * model.settings.width * model.settings.width;
+    if (model.settings.width % model.settings.heads != 0 ||
+        static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
+        fail("model.settings", "%s: does not hold the %lld weights and more that its own settings call for",
+             path.c_str(), static_cast<long long>(weights));
     model.environment = make_environment(model.settings);
     model.compute = std::make_unique<Compute>(choose_kernel(arguments["--kernel"]), thread_count(arguments));
     model.run = std::make_unique<Run>(*model.compute, model.settings, model.environment.spec());
@@ -1659,27 +1711,31 @@ double estimated_seconds(const Settings& settings) {
 
 void command_sweep(const Arguments& arguments) {
     const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
+    const bool estimate = !arguments["--estimate"].empty();
+    std::vector<Settings> all;  // checked before anything is printed: a job runner may be reading
+    for (const std::string& method : split(arguments["--methods"], ','))
+        all.push_back(default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0], method,
+                                       arguments["--preset"]));
     double seconds = 0;
-    for (const std::string& method : split(arguments["--methods"], ',')) {
-        const Settings settings =
-            default_settings(arguments.words.empty() ? "gridworld" : arguments.words[0], method, arguments["--preset"]);
-        if (!arguments["--estimate"].empty())
-            seconds += estimated_seconds(settings) * static_cast<double>(seeds.size());
-        for (const int64_t seed : seeds)
-            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld\n",
-                        arguments["--estimate"].empty() ? "" : "# ", settings.task.c_str(), settings.method.c_str(),
-                        settings.preset.c_str(), static_cast<long long>(seed));
+    for (const Settings& settings : all) {
+        check_together(settings);
+        if (estimate) seconds += estimated_seconds(settings) * static_cast<double>(seeds.size());
     }
-    if (!arguments["--estimate"].empty())
-        std::printf(
-            "# about %.1f hours on this machine, one after the other; whatever is interrupted continues with the same command\n",
-            seconds / 3600);
+    for (const Settings& settings : all)
+        for (const int64_t seed : seeds)
+            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld\n", estimate ? "# " : "",
+                        settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
+                        static_cast<long long>(seed));
+    if (estimate)
+        std::printf("# about %.1f hours on this machine, one after the other; what is interrupted continues\n",
+                    seconds / 3600);
 }
 
 template <class T>
 std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
     const std::vector<T> values = file.get<T>(tensor.name, tensor.shape);
-    if (values.empty()) return "empty";
+    if (std::none_of(values.begin(), values.end(), [](T value) { return std::isfinite(static_cast<double>(value)); }))
+        return "nothing finite";
     double low = INFINITY, high = -INFINITY, sum = 0;
     size_t bad = 0;
     for (const T value : values) {
@@ -1699,11 +1755,15 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
 void command_info(const Arguments& arguments) {
     const std::string& path = arguments.words[0];
     const std::string bytes = read_file(path);
-    std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), bytes.size(), hex8(crc32(bytes)).c_str());
+    const uint32_t checksum = crc32(bytes);
     const TensorFile file = parse_safetensors(bytes, path);
-    for (const auto& [key, text] : file.metadata)
-        std::printf("%s%s%s%s", key.c_str(), text.find('\n') == std::string::npos ? ": " : ":\n", text.c_str(),
-                    text.ends_with('\n') ? "" : "\n");
+    std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), bytes.size(), hex8(checksum).c_str());
+    for (const auto& [key, text] : file.metadata) {
+        std::string shown = key + (text.find('\n') == std::string::npos ? ": " : ":\n") + text;
+        for (char& c : shown)
+            if (static_cast<unsigned char>(c) < ' ' && c != '\n') c = '?';  // a file may not drive the terminal
+        std::printf("%s%s", shown.c_str(), shown.ends_with('\n') ? "" : "\n");
+    }
     for (const StoredTensor& tensor : file.tensors) {
         std::string range;
         if (tensor.dtype == DType::F32) range = value_range<float>(file, tensor);
@@ -1835,7 +1895,7 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
     for (const Option& option : command.options)
         arguments.options[option.name] = option.fallback, names.push_back(option.name);
     for (size_t i = 0; i < words.size(); ++i) {
-        if (!words[i].starts_with("--")) {
+        if (!words[i].starts_with("-") || words[i].size() < 2) {
             arguments.words.push_back(words[i]);
             continue;
         }
@@ -1851,8 +1911,11 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
             arguments.options[option->name] = "yes";
             continue;
         }
-        if (i + 1 == words.size()) fail("usage.option", "option %s needs a value: %s", option->name, option->value);
+        if (i + 1 == words.size() || words[i + 1].starts_with("--"))
+            fail("usage.option", "option %s needs a value: %s", option->name, option->value);
         const std::string& value = words[++i];
+        if (value.empty())
+            fail("usage.option", "option %s needs a value that is not empty: %s", option->name, option->value);
         if (std::string(option->name) == "--set") {
             arguments.assignments.push_back(value);
             continue;
@@ -1868,8 +1931,16 @@ Arguments parse_arguments(const Command& command, const std::vector<std::string>
 }
 
 int run_command_line(const std::vector<std::string>& words) {
-    if (words.empty() || words[0] == "--help" || words[0] == "help") {
+    const auto asks_for_help = [](const std::string& word) {
+        return word == "--help" || word == "-h" || word == "help";
+    };
+    const auto flush = [] {
+        if (std::fflush(stdout) != 0 || std::ferror(stdout))
+            fail("console.write", "cannot write the results to stdout: is the disk full?");
+    };
+    if (words.empty() || asks_for_help(words[0])) {
         print_help(nullptr);
+        flush();
         return words.empty() ? 2 : 0;
     }
     std::vector<std::string> names;
@@ -1877,12 +1948,11 @@ int run_command_line(const std::vector<std::string>& words) {
         names.push_back(command.name);
         if (words[0] != command.name) continue;
         const std::vector<std::string> rest(words.begin() + 1, words.end());
-        if (std::find(rest.begin(), rest.end(), "--help") != rest.end())
+        if (std::any_of(rest.begin(), rest.end(), asks_for_help))
             print_help(&command);
         else
             command.run(parse_arguments(command, rest));
-        if (std::fflush(stdout) != 0 || std::ferror(stdout))
-            fail("console.write", "cannot write the results to stdout: is the disk full?");
+        flush();
         return 0;
     }
     fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(),

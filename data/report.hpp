@@ -290,14 +290,14 @@ inline double last_ten(const Run& run, Quantity quantity) {
     return count > 0 ? sum / count : none;
 }
 
-constexpr int curve_step = 250;  // interactions
-
-// Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run.
+// Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run; long
+// runs in larger steps, at most about 400.
 inline std::vector<double> curve_points(const Runs& runs) {
     double largest = 0;
     for (const Run* run : runs) largest = std::max(largest, run->so_far);
+    const double step = 250 * std::max(1.0, std::ceil(largest / 250 / 400));
     std::vector<double> out;
-    for (double at = 0; at <= largest; at += curve_step) out.push_back(at);
+    for (double at = 0; at <= largest; at += step) out.push_back(at);
     return out;
 }
 
@@ -486,8 +486,8 @@ inline std::string curve_caption(const std::vector<Runs>& by_method) {
     return who(by_method) +
            ". Lines: mean over seeds; bands: one standard deviation to either side, none for one seed." +
            (dt ? " DT has no online phase and is the dashed line, its mean over seeds." : "") +
-           " Seeds are evaluated at different interactions; drawn every " + std::to_string(curve_step) +
-           " interactions, each seed by its last evaluation until then, and at the last point by its final one." +
+           " Seeds are evaluated at different interactions; drawn at equal steps (of 250 interactions in a short run), each "
+           "seed by its last evaluation until then, and at the last point by its final one." +
            if_unfinished(by_method,
                          " Unfinished seeds count up to their own last interactions, so that a line may jump where one "
                          "of them ends.");

@@ -121,7 +121,8 @@ inline void write_file_atomic(const std::string& path, std::span<const std::stri
     try {
         for (const std::string_view piece : pieces) write_all(file, piece, temporary);
         sync_to_disk(file, temporary);
-        if (::rename(temporary.c_str(), path.c_str()) != 0) fail_file("file.write", "rename PATH.tmp to it", path);
+        if (::rename(temporary.c_str(), path.c_str()) != 0)
+            fail_file("file.write", "rename its temporary file to it", path);
     } catch (const Error&) {
         ::unlink(temporary.c_str());
         throw;

@@ -573,6 +573,34 @@ TEST(a_folder_of_other_settings_is_left_alone) {
     CHECK(read_file(scratch / "run/model.safetensors") == before);
 }
 
+TEST(a_start_that_came_to_nothing_does_not_keep_the_folder) {
+    const Scratch scratch;
+    fs::create_directory(scratch / "run");
+    write_file_atomic(scratch / "run/settings", settings_text(tiny_settings("odt")));  // killed before the first log
+    quiet_train(tiny_settings("dt"), scratch / "run");
+    CHECK(fs::exists(scratch / "run/finished"));
+}
+
+TEST(two_processes_do_not_work_in_one_folder) {
+    const Scratch scratch;
+    fs::create_directory(scratch / "run");
+    const FolderLock other(scratch / "run");
+    CHECK_FAILS("run.busy", quiet_train(tiny_settings("dt"), scratch / "run"));
+}
+
+TEST(a_checkpoint_of_another_seed_is_refused) {
+    const Scratch scratch;
+    stop_requested = 1;
+    Settings other = tiny_settings("odt");
+    other.seed = 5;
+    CHECK_FAILS("run.stopped", quiet_train(other, scratch / "five"));
+    CHECK_FAILS("run.stopped", quiet_train(tiny_settings("odt"), scratch / "zero"));
+    stop_requested = 0;
+    fs::copy_file(scratch / "five/checkpoint.safetensors", scratch / "zero/checkpoint.safetensors",
+                  fs::copy_options::overwrite_existing);
+    CHECK_FAILS("run.other_settings", quiet_train(tiny_settings("odt"), scratch / "zero"));
+}
+
 TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
     const Scratch scratch;
     stop_requested = 1;
@@ -609,10 +637,22 @@ TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
     CHECK_FAILS("checkpoint.shape", quiet_train(tiny_settings("wodtem"), scratch / "run"));
 
     write_file_atomic(path, good);
-    truncate_file(scratch / "run/episodes.csv", 3);
+    const std::string episodes = read_file(scratch / "run/episodes.csv");
+    std::string edited = episodes;
+    edited[1] = 'x';
+    write_file_atomic(scratch / "run/episodes.csv", edited);
+    CHECK_FAILS("run.log", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    write_file_atomic(scratch / "run/episodes.csv", episodes.substr(0, 3));
     CHECK_FAILS("run.log", quiet_train(tiny_settings("wodtem"), scratch / "run"));
     write_file_atomic(scratch / "run/settings", "width = 8 # half a file");
     CHECK_FAILS("settings.missing", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+}
+
+TEST(mean_lengths_are_exact) {
+    Settings settings = tiny_settings("odt");
+    Fixture f(settings);
+    const double length = evaluate(f.run, GridWorld{}, 0, 1).mean_length;
+    CHECK_EQUAL(evaluate(f.run, GridWorld{}, 0, 11).mean_length, length);  // nothing is random: eleven times the same
 }
 
 TEST(damaged_models_are_refused) {
@@ -710,6 +750,7 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --seed -1", 2, "nearest is 0");
     check_shell("./wodtem train gridworld --seed 1 --seed 2", 2, "given twice");
     check_shell("./wodtem train gridworld --seed", 2, "needs a value");
+    check_shell("./wodtem train gridworld --out --set alpha=1", 2, "needs a value");
     check_shell("./wodtem train gridworld --seed 1 --seeds 0-4", 2, "choose one");
     check_shell("./wodtem train hopper-medium", 2, "not part of this version");
     check_shell("./wodtem train gridworld --set alpha=2", 2, "nearest is 1");
@@ -720,6 +761,13 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --threads 1000", 2, "nearest is 256");
     check_shell("./wodtem train", 2, "TASK");
     check_shell("./wodtem sweep --seeds 4-0", 2, "range");
+    check_shell("./wodtem sweep --seeds 1,1", 2, "given twice");
+    check_shell("./wodtem sweep --methods odt,,dt", 2, "method cannot be");
+    check_shell("./wodtem train gridworld --seeds ''", 2, "not empty");
+    check_shell("./wodtem train -h", 0, "updates_per_iteration");
+    check_shell("(ulimit -v 2000000; ./wodtem train gridworld --threads 256 --out /tmp/wodtem-no-threads)", 1,
+                "threads");
+    fs::remove_all("/tmp/wodtem-no-threads");
 }
 
 TEST(failures_exit_with_one_and_a_sentence) {
