@@ -282,6 +282,8 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
                              int columns, bool add) {
     typedef Vector Unaligned __attribute__((aligned(4), may_alias));
     constexpr int lanes = sizeof(Vector) / sizeof(float), tile_columns = lanes * Vectors;
+    for (int r = 0; r < rows; ++r)  // C is far away, and wanted only at the end
+        for (int j = 0; j < columns; j += 16) __builtin_prefetch(c + static_cast<ptrdiff_t>(r) * c_stride + j, 1);
     Vector sum[Rows][Vectors] = {};
     for (int k = 0; k < depth; ++k) {
         Vector row_of_b[Vectors];

@@ -1,11 +1,13 @@
 // wodtem.cpp: weighting online decision transformer with episodic memory: the method, and the command line around it.
 //
-// In order: settings (Tables I and II and the per-dataset table, each value with its source); the agent and all training state; batches and the
-// memory's advice, eqs. (4) to (7); the objective and its two steps, eqs. (1) to (3) and (8) to (10); acting and
-// evaluation, sec. III-B; the offline and the online phase, sec. IV-B.3; the run folder; commands; main.
-// One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and
-// the online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit. Promises: a run is a function of
-// its settings: the same bytes for any number of threads, in one go or continued.
+// In order: settings (Tables I and II and the per-dataset table, each value with its source); the agent and all training
+// state; batches and the memory's advice, eqs. (4) to (7); the objective and its two steps, eqs. (1) to (3) and (8) to
+// (10); acting and evaluation, sec. III-B; the run folder; the offline and the online phase, sec. IV-B.3; the command
+// line; main.
+// One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and the
+// online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
+// Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
+// Leaves out: environments other than the grid world, data sets from files.
 
 #include <sys/file.h>
 #include <sys/ioctl.h>
@@ -15,7 +17,6 @@
 #include <csignal>
 #include <filesystem>
 #include <functional>
-#include <iostream>
 #include <map>
 #include <optional>
 #include <set>
@@ -28,8 +29,8 @@
 #include "nn.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Settings. The initial values are the paper's grid world, and `setting_rows` gives each one's range and
-// source; `task_rows` says what the other tasks change.
+// Settings. The initial values are the paper's grid world; `setting_rows` gives each one's range and source, and
+// `task_rows` what the other tasks change.
 
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
@@ -154,6 +155,9 @@ inline const TaskRow task_rows[] = {
     {"", "", "learning_rate", "1e-4", "ODT's code"},
     {"", "", "weight_decay", "5e-4", "ODT's code"},
     {"", "", "offline_updates", "5000", "ODT's code"},
+    {"", "", "position", "no", "ODT's code"},
+    {"", "", "gamma", "0.99", "WODTEM sec. V-C"},
+    {"", "", "epsilon", "0.1", "WODTEM sec. V-C"},
     {"", "", "online_steps", "200000", "WODTEM sec. V-C"},
     {"", "", "projected_dim", "4", "WODTEM sec. V-C"},
     {"", "", "table_size", "2e6", "WODTEM sec. V-C"},

@@ -196,6 +196,9 @@ TEST(the_other_tasks_have_table_two_and_the_per_dataset_values) {
     const Settings dt = default_settings("hopper-medium-v2", "dt", "paper");
     CHECK(dt.width == 128 && dt.layers == 3 && dt.heads == 1 && dt.batch_size == 64 && dt.optimizer == "adamw" &&
           dt.eval_context == 20);
+    for (const char* method : {"dt", "odt", "wodtem"})  // no value is credited to the grid world's table
+        CHECK(settings_text(default_settings("hopper-medium-v2", method, "paper")).find("Table I:") ==
+              std::string::npos);
     CHECK_FAILS("usage.task", check_together(default_settings("hopper-medium", "wodtem", "paper")));
 }
 
