@@ -406,6 +406,20 @@ struct Compute {
                    std::vector<Line>(lines_for(static_cast<size_t>(block_tiles * chosen.tile_rows * sum_block)))) {}
 };
 
+// to[j * to_stride + i] = from[i * from_stride + j] for i, j < 4.
+inline void turn_4x4(float* to, int to_stride, const float* from, int from_stride) {
+    typedef Float4 Unaligned __attribute__((aligned(4), may_alias));
+    Float4 row[4];
+    for (ptrdiff_t i = 0; i < 4; ++i) row[i] = *reinterpret_cast<const Unaligned*>(from + i * from_stride);
+    const Float4 a = __builtin_shufflevector(row[0], row[1], 0, 4, 1, 5),
+                 b = __builtin_shufflevector(row[2], row[3], 0, 4, 1, 5),
+                 c = __builtin_shufflevector(row[0], row[1], 2, 6, 3, 7),
+                 d = __builtin_shufflevector(row[2], row[3], 2, 6, 3, 7);
+    const Float4 column[4] = {__builtin_shufflevector(a, b, 0, 1, 4, 5), __builtin_shufflevector(a, b, 2, 3, 6, 7),
+                              __builtin_shufflevector(c, d, 0, 1, 4, 5), __builtin_shufflevector(c, d, 2, 3, 6, 7)};
+    for (ptrdiff_t j = 0; j < 4; ++j) *reinterpret_cast<Unaligned*>(to + j * to_stride) = column[j];
+}
+
 // Copies `used` lines of `depth` elements into a panel [depth, width], filling up with zeros; element (k, w) of the
 // panel comes from view(k, w) offset by (first_k, first_w).
 inline void pack_panel(float* panel, View<const float> view, int first_k, int first_w, int depth, int used, int width) {
@@ -417,9 +431,14 @@ inline void pack_panel(float* panel, View<const float> view, int first_k, int fi
         }
         return;
     }
-    for (int w = 0; w < used; ++w) {
-        const float* line = &view(first_k, first_w + w);
-        for (int k = 0; k < depth; ++k) panel[k * width + w] = line[k];
+    for (int w = 0; w < used; w += 4) {  // the lines lie along k: turn blocks of 4 x 4
+        const int lines = std::min(4, used - w), whole = lines == 4 ? depth / 4 * 4 : 0;
+        for (int k = 0; k < whole; k += 4)
+            turn_4x4(panel + k * width + w, width, &view(first_k + k, first_w + w), view.stride);
+        for (int i = 0; i < lines; ++i) {
+            const float* line = &view(first_k, first_w + w + i);
+            for (int k = whole; k < depth; ++k) panel[k * width + w + i] = line[k];
+        }
     }
     for (int k = 0; used < width && k < depth; ++k)
         for (int w = used; w < width; ++w) panel[k * width + w] = 0;

@@ -1801,7 +1801,7 @@ void command_tasks(const Arguments& arguments) {
 void command_bench(const Arguments& arguments) {
     const Kernel& chosen = choose_kernel(arguments["--kernel"]);
     const int threads = thread_count(arguments);
-    std::printf("medians of 7 runs, and their range\n");
+    std::printf("medians and ranges; a product's share is of the peak measured just before and after it\n");
     for (const Kernel* kernel : kernels)
         if (kernel->supported() && (arguments["--kernel"] == "auto" || kernel == &chosen)) bench_products(*kernel);
     std::printf("%s:\n", chosen.name);
