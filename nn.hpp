@@ -161,7 +161,7 @@ class Threads {
     using Call = void (*)(void*, int, int);
 
     static void pause(int spins) {
-        if (spins > 4000) std::this_thread::yield();
+        if (spins > 2000) std::this_thread::yield();
 #if defined(__x86_64__)
         __builtin_ia32_pause();
 #endif
@@ -191,12 +191,13 @@ class Threads {
         for (std::thread& worker : workers_) worker.join();
     }
 
-    // Spins a little between jobs (they follow each other within microseconds), then sleeps.
+    // Spins for some milliseconds between jobs, soon giving way to whoever else wants the core, then sleeps: to be woken
+    // can take longer than a small job, above all on a virtual machine.
     void work(int worker) {
         while (true) {
             const uint64_t seen = take_tasks(worker);
             if (stop_.load(std::memory_order_relaxed)) return;  // `seen` may be the last ticket: none follows it
-            for (int spins = 0; spins < 1000 && ticket_.load(std::memory_order_relaxed) == seen; ++spins) pause(spins);
+            for (int spins = 0; spins < 20000 && ticket_.load(std::memory_order_relaxed) == seen; ++spins) pause(spins);
             ticket_.wait(seen, std::memory_order_acquire);
         }
     }
