@@ -1,5 +1,5 @@
-# WODTEM: a reference implementation in one binary. Needs g++ (12 or newer) and make; `make run` and `make test` install
-# g++ with apt where it is missing.
+# WODTEM: a reference implementation in one binary. Needs g++ (12 or newer) and, for all tasks but the grid world, MuJoCo
+# 2.2; both are installed with apt where they are missing. Without MuJoCo the grid world still builds.
 #
 #   make run              build, run DT, ODT and WODTEM on the grid world (preset small, about a minute), show the report
 #   make test             build and run every test; the last line is "N passed, N failed"
@@ -15,18 +15,23 @@ CXX = g++
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
 CXXFLAGS = -std=c++20 -O3 -pthread -ffp-contract=off \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
-HEADERS = $(wildcard *.hpp data/*.hpp tests/*.hpp)
+HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml tests/*.hpp)
+# Asked when it is needed, after `packages`.
+LIBRARIES = $(shell $(CXX) -E -x c++ -include mujoco/mujoco.h /dev/null >/dev/null 2>&1 && echo -lmujoco)
 TESTS = $(patsubst tests/%.cpp,%,$(wildcard tests/*.cpp))
 SOURCES = $(wildcard *.hpp *.cpp data/*.hpp tests/*.hpp tests/*.cpp)
 
-wodtem: wodtem.cpp $(HEADERS) | compiler
-	$(CXX) $(CXXFLAGS) $< -o $@
+wodtem: wodtem.cpp $(HEADERS) | packages
+	$(CXX) $(CXXFLAGS) $< -o $@ $(LIBRARIES)
 
-# A fresh Debian has apt and make at most.
-compiler:
+# A fresh Debian has apt and make at most. Without g++ nothing goes on, without MuJoCo all but its tasks.
+ROOT = $$(test "$$(id -u)" = 0 || echo sudo -n)
+packages:
 	@command -v $(CXX) >/dev/null || { echo "installing g++"; \
-	  if [ "$$(id -u)" = 0 ]; then apt-get update -qq && apt-get install -y -qq g++; \
-	  else sudo apt-get update -qq && sudo apt-get install -y -qq g++; fi; }
+	  $(ROOT) apt-get update -qq && $(ROOT) apt-get install -y -qq g++; }
+	@test "$(LIBRARIES)" || { echo "installing libmujoco-dev"; \
+	  $(ROOT) apt-get update -qq && $(ROOT) apt-get install -y -qq libmujoco-dev; } || \
+	  echo "MuJoCo 2.2 is missing: only the grid world is built; for the rest: apt-get install libmujoco-dev, make clean, make"
 
 run: wodtem
 	@for method in dt odt wodtem; do ./wodtem train gridworld --method $$method --seed 0 --preset small || exit 1; done
@@ -38,26 +43,26 @@ paper-gridworld: wodtem
 	./wodtem report --out runs/report-paper runs/gridworld-paper-*
 
 # One object per test file, so that make -j helps; test_wodtem.cpp includes wodtem.cpp.
-build/%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
+build/%.o: tests/%.cpp wodtem.cpp $(HEADERS) | packages
 	@mkdir -p build
 	$(CXX) $(CXXFLAGS) -O2 -c $< -o $@
 
 build/tests: $(TESTS:%=build/%.o)
-	$(CXX) $(CXXFLAGS) $^ -o $@
+	$(CXX) $(CXXFLAGS) $^ -o $@ $(LIBRARIES)
 
 test: wodtem build/tests
 	build/tests
 
-build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | compiler
+build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | packages
 	@mkdir -p build
 	$(CXX) $(CXXFLAGS) -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -c $< -o $@
 
 build/tests-sanitized: $(TESTS:%=build/san-%.o)
-	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@
+	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@ $(LIBRARIES)
 
-build/tests-threads: tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp wodtem.cpp $(HEADERS) | compiler
+build/tests-threads: tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp wodtem.cpp $(HEADERS) | packages
 	@mkdir -p build
-	$(CXX) $(CXXFLAGS) -O1 -fsanitize=thread tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp -o $@
+	$(CXX) $(CXXFLAGS) -O1 -fsanitize=thread tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp -o $@ $(LIBRARIES)
 
 sanitize: wodtem build/tests-sanitized build/tests-threads
 	build/tests-threads threads number_of_threads
@@ -72,4 +77,4 @@ format:
 clean:
 	rm -rf build wodtem
 
-.PHONY: compiler run paper-gridworld test sanitize bench format clean
+.PHONY: packages run paper-gridworld test sanitize bench format clean

@@ -21,6 +21,8 @@
 // ---------------------------------------------------------------------------------------------------------------------
 // What every environment of the project offers: spec(), reset() and step() with these two records.
 
+constexpr uint64_t data_set_episodes = uint64_t{1} << 41;  // the numbers of a data set's episodes start here
+
 struct EnvironmentSpec {
     int state_dim;          // floats per state
     int action_dim;         // floats per stored action; a discrete action is one float, the index of the move
@@ -174,7 +176,7 @@ inline Trajectory collect_trajectory(GridWorld world, Behaviour behaviour, uint3
     Trajectory trajectory;
     trajectory.terminated = false;
     std::vector<float> state(spec.state_dim);
-    world.reset(Random{seed, Stream::environment}, (uint64_t{1} << 41) + number, state.data());
+    world.reset(Random{seed, Stream::environment}, data_set_episodes + number, state.data());
     for (int time = 0; time < spec.max_episode_steps && !trajectory.terminated; ++time) {
         const auto weights = behaviour_weights(behaviour, world.edge, world.cell);
         const float action = static_cast<float>(draw_move(weights, Random{seed, Stream::data_set}, number, time));

@@ -77,7 +77,7 @@ enum class Stream : uint32_t {
     entropy_noise = 6,      // the same; site: action dimension
     environment = 7,  // step: episode (evaluations count from 2^40, data sets from 2^41); index: draw in the reset
     projection = 8,   // step: 0; index: element of the random projection
-    data_set = 9,     // step: trajectory; index: time-step
+    data_set = 9,     // step: trajectory; index: time-step; site: action dimension
 };
 
 struct Random {
