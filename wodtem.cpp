@@ -7,7 +7,7 @@
 // One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and the
 // online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
 // Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
-// Leaves out: environments other than the grid world, data sets from files.
+// Leaves out: data sets from files.
 
 #include <sys/file.h>
 #include <sys/ioctl.h>
@@ -17,7 +17,9 @@
 #include <csignal>
 #include <filesystem>
 #include <functional>
+#include <iostream>
 #include <map>
+#include <numeric>
 #include <optional>
 #include <set>
 #include <variant>
@@ -26,6 +28,7 @@
 #include "data/safetensors.hpp"
 #include "gridworld.hpp"
 #include "memory.hpp"
+#include "mujoco_env.hpp"
 #include "nn.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -34,6 +37,7 @@
 
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
+    std::string physics = "none", mujoco = "none";
     int64_t seed = 0;
 
     int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
@@ -75,7 +79,8 @@ struct SettingRow {
 constexpr const char* task_names =
     "gridworld|hopper-medium-v2|hopper-medium-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|"
     "halfcheetah-medium-v2|halfcheetah-medium-replay-v2|ant-medium-v2|ant-medium-replay-v2|antmaze-umaze-v2|"
-    "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1";
+    "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|walker2d-v2|halfcheetah-v2|"
+    "ant-v2";
 constexpr double many = 1e9;
 inline const SettingRow setting_rows[] = {
     {"task", &Settings::task, 0, 0, task_names, "command line"},
@@ -83,6 +88,8 @@ inline const SettingRow setting_rows[] = {
     {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
     {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
     {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
+    {"physics", &Settings::physics, 0, 0, "none|d4rl|2.2", "the task has no bodies"},
+    {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
     // The network.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
@@ -129,7 +136,7 @@ inline const SettingRow setting_rows[] = {
     {"exclude_self", &Settings::exclude_self, 0, 0, "",
      "WODTEM sec. IV-B.2: no exception is made for the state itself"},
     // The grid world.
-    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down",
+    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down|random",
      "chosen: the paper's statistics rule out its words"},
     {"edge", &Settings::edge, 0, 0, "clipped|stays|wraps|excluded", "chosen: fits the paper's statistics"},
     {"state_encoding", &Settings::state_encoding, 0, 0, "coordinates|one_hot", "chosen: (row, column)"},
@@ -163,6 +170,10 @@ inline const TaskRow task_rows[] = {
     {"", "", "table_size", "2e6", "WODTEM sec. V-C"},
     {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
     {"", "", "K", "2", "WODTEM sec. V-C"},
+    {"", "", "physics", "d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
+    {"", "", "behaviour", "random", "chosen: uniformly random actions, until data sets can be read"},
+    {"", "", "data_trajectories", "10", "chosen: enough to normalise states by"},
+    {"", "", "data_seed", "0", "chosen"},
     {"hopper", "", "g_eval", "3600", "ODT's code"},
     {"hopper", "", "g_online", "7200", "ODT's code"},
     {"hopper", "", "eta", "-3", "ODT's code: minus the action dimensions"},
@@ -221,6 +232,16 @@ inline const TaskRow task_rows[] = {
     {"", "dt", "offline_updates", "100000", "DT's code"},
     {"", "dt", "position", "yes", "DT's code"},
     {"maze2d", "dt", "reward_scale", "1", "chosen: as others' DT on maze2d"},
+};
+
+// Preset small: everything else as in preset paper. A network and a schedule for two cores and half an hour.
+inline const TaskRow small_rows[] = {
+    {"", "", "layers", "2", "preset small"},
+    {"", "", "heads", "2", "preset small"},
+    {"", "", "width", "64", "preset small"},
+    {"", "", "batch_size", "64", "preset small"},
+    {"", "", "updates_per_iteration", "30", "preset small"},
+    {"", "", "online_steps", "20000", "preset small"},
 };
 
 // The number of single-letter changes from one word to the other (Levenshtein), for "did you mean".
@@ -299,7 +320,7 @@ void set_setting(Settings& settings, const std::string& name, const std::string&
     const SettingRow& row = setting_row(name);
     if (auto field = std::get_if<std::string Settings::*>(&row.field)) {
         const std::vector<std::string> choices = split(row.choices, '|');
-        if (std::find(choices.begin(), choices.end(), text) == choices.end())
+        if (*row.choices != 0 && std::find(choices.begin(), choices.end(), text) == choices.end())
             fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
                  row.choices, nearest_name(text, choices).c_str());
         settings.** field = text;
@@ -346,7 +367,9 @@ Settings default_settings(const std::string& task, const std::string& method, co
     for (const TaskRow& row : task_rows)
         if (!gridworld && settings.task.starts_with(row.task) && (*row.method == 0 || method == row.method))
             set_from(settings, row.name, row.value, row.source);
-    if (preset == "small") set_from(settings, "width", "8", "preset small: everything else as in Table I");
+    if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
+    if (preset == "small" && !gridworld)
+        for (const TaskRow& row : small_rows) set_from(settings, row.name, row.value, row.source);
     if (method == "dt") {
         set_from(settings, "online_steps", "0", "DT learns offline only");
         for (const char* name : {"layers", "heads", "width", "context_length", "learning_rate", "weight_decay",
@@ -368,10 +391,13 @@ void check_together(const Settings& settings) {
     if (settings.online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
              static_cast<long long>(settings.online_steps));
-    if (settings.task != "gridworld")
-        fail("usage.task",
-             "the settings of %s are known, but its environment is not part of this version; gridworld can be trained",
-             settings.task.c_str());
+    const bool gridworld = settings.task == "gridworld";
+    if (gridworld != (settings.physics == "none"))
+        fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
+             gridworld ? "a table of moves: none" : "d4rl or 2.2");
+    if (gridworld == (settings.behaviour == "random"))
+        fail("usage.setting", "%s cannot have behaviour %s; it is %s", settings.task.c_str(),
+             settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "random");
 }
 
 // name = value    # source
@@ -510,6 +536,7 @@ struct Progress {
     double pairs = 0, short_pairs = 0, unmatched_pairs = 0;
     double matched = 0, evicted = 0;  // states that the table knew already; entries it had to give up
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
+    double dropped = 0;  // episodes that the physics engine spoiled
     double eval_length = NAN, eval_return = NAN;
 
     template <class Archive>
@@ -539,6 +566,7 @@ struct Progress {
                                                                     {"progress.rollout_length", rollout_length},
                                                                     {"progress.rollout_return", rollout_return},
                                                                     {"progress.rollouts", rollouts},
+                                                                    {"progress.dropped", dropped},
                                                                     {"progress.eval_length", eval_length},
                                                                     {"progress.eval_return", eval_return}})
             archive(name, field);
@@ -889,6 +917,8 @@ struct Episode {
     std::vector<float> state;          // [state_dim] the present one
     std::vector<float> returns_to_go;  // [t + 1] scaled
     bool over = false;
+    std::string problem;           // why the episode is worth nothing, if it is
+    std::exception_ptr exception;  // for whoever waits for its thread
 };
 
 // The latest `context` steps of every episode that goes on, the present state last.
@@ -913,18 +943,38 @@ SequenceBatch acting_batch(const Agent& agent, const std::vector<Episode>& episo
     return batch;
 }
 
-// Plays `count` episodes numbered from `first_episode` side by side, through the network as one batch.
+// One step of an episode. What the engine makes of a state beyond its reach is no data: the episode is over, and spoiled.
+template <class Environment>
+void step_episode(Episode& episode, Environment& environment, const std::vector<float>& action, double reward_scale) {
+    Trajectory& trajectory = episode.trajectory;
+    trajectory.states.insert(trajectory.states.end(), episode.state.begin(), episode.state.end());
+    trajectory.actions.insert(trajectory.actions.end(), action.begin(), action.end());
+    try {
+        const Step step = environment.step(action.data(), episode.state.data());
+        trajectory.rewards.push_back(static_cast<float>(step.reward));
+        trajectory.terminated = episode.over = step.terminated;
+        episode.returns_to_go.push_back(episode.returns_to_go.back() - static_cast<float>(step.reward * reward_scale));
+    } catch (const Error& error) {
+        if (error.id != "mujoco.unstable") throw;
+        trajectory.rewards.push_back(0);
+        episode.over = true;
+        episode.problem = error.what();
+    }
+}
+
+// Plays `count` episodes numbered from `first_episode` side by side, through the network as one batch; environments
+// step on the threads there are. `environments`: at least as many, in whatever state.
 // WODTEM sec. III-B: g_1 = target; a_t from the policy (sampled, or the most likely one); g_{t+1} = g_t - r_t.
 template <class Environment>
-std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act, double target, uint64_t first_episode,
-                                int count) {
+std::vector<Episode> rollout(Run& run, std::vector<Environment>& environments, Act act, double target,
+                             uint64_t first_episode, int count) {
     const Agent& agent = run.agent;
     const EnvironmentSpec& spec = agent.spec;
-    std::vector<Environment> environments(static_cast<size_t>(count), prototype);
+    const double reward_scale = agent.settings.reward_scale;
     std::vector<Episode> episodes(static_cast<size_t>(count));
     for (size_t i = 0; i < episodes.size(); ++i) {
         episodes[i].state.resize(static_cast<size_t>(spec.state_dim));
-        episodes[i].returns_to_go = {static_cast<float>(target * agent.settings.reward_scale)};
+        episodes[i].returns_to_go = {static_cast<float>(target * reward_scale)};
         environments[i].reset(run.random(Stream::environment), first_episode + i, episodes[i].state.data());
     }
     for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps); ++t) {
@@ -932,49 +982,60 @@ std::vector<Trajectory> rollout(Run& run, const Environment& prototype, Act act,
         if (batch.lengths.empty()) break;
         run.acting.reset();
         const Policy<float> policy = forward(run.acting, agent.model, batch, Ask::last_state);
-        int row = 0;
+        std::vector<size_t> going;
+        std::vector<std::vector<float>> actions;
         for (size_t i = 0; i < episodes.size(); ++i) {
-            Episode& episode = episodes[i];
-            if (episode.over) continue;
-            const std::vector<float> action =
-                choose_action(agent, policy, row++, act, run.random(Stream::exploration), first_episode + i, t);
-            Trajectory& trajectory = episode.trajectory;
-            trajectory.states.insert(trajectory.states.end(), episode.state.begin(), episode.state.end());
-            trajectory.actions.insert(trajectory.actions.end(), action.begin(), action.end());
-            const Step step = environments[i].step(action.data(), episode.state.data());
-            trajectory.rewards.push_back(static_cast<float>(step.reward));
-            trajectory.terminated = episode.over = step.terminated;
-            episode.returns_to_go.push_back(episode.returns_to_go.back() -
-                                            static_cast<float>(step.reward * agent.settings.reward_scale));
+            if (episodes[i].over) continue;
+            actions.push_back(choose_action(agent, policy, static_cast<int>(going.size()), act,
+                                            run.random(Stream::exploration), first_episode + i, t));
+            going.push_back(i);
         }
+        run.compute.threads.run(static_cast<int>(going.size()), [&](int task, int) {
+            const size_t row = static_cast<size_t>(task), i = going[row];
+            try {
+                step_episode(episodes[i], environments[i], actions[row], reward_scale);
+            } catch (...) {
+                episodes[i].exception = std::current_exception();
+            }
+        });
+        for (const Episode& episode : episodes)
+            if (episode.exception) std::rethrow_exception(episode.exception);
     }
-    std::vector<Trajectory> trajectories;
-    for (Episode& episode : episodes) {
+    for (Episode& episode : episodes)
         relabel(episode.trajectory, spec.state_dim, spec.action_dim, agent.settings.gamma);
-        trajectories.push_back(std::move(episode.trajectory));
-    }
-    return trajectories;
+    return episodes;
+}
+
+void report_dropped(Run& run, const Episode& episode, const char* kind) {
+    run.progress.dropped += 1;
+    std::fprintf(stderr, "wodtem: %s episode is dropped: %s\n", kind, episode.problem.c_str());
 }
 
 constexpr uint64_t evaluation_episodes = uint64_t{1} << 40;  // their numbers start here, those of online episodes at 0
 
 struct Evaluation {
-    double mean_length = 0, mean_return = 0;
-    std::vector<Trajectory> episodes;
+    double mean_length = NAN, mean_return = NAN;  // of the episodes that the engine has not spoiled
+    std::vector<Episode> episodes;
 };
 
 // WODTEM sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. `number`: of the evaluation.
 template <class Environment>
-Evaluation evaluate(Run& run, const Environment& environment, uint64_t number, int count) {
+Evaluation evaluate(Run& run, std::vector<Environment>& environments, uint64_t number, int count) {
     Evaluation result;
     const uint64_t first = evaluation_episodes + number * static_cast<uint64_t>(count);
-    result.episodes = rollout(run, environment, Act::most_likely, run.agent.settings.g_eval, first, count);
-    for (const Trajectory& episode : result.episodes) {
-        result.mean_length += episode.length();
-        result.mean_return += total_return(episode);
+    result.episodes = rollout(run, environments, Act::most_likely, run.agent.settings.g_eval, first, count);
+    double length = 0, total = 0, sound = 0;
+    for (const Episode& episode : result.episodes) {
+        if (!episode.problem.empty()) {
+            report_dropped(run, episode, "an evaluation");
+            continue;
+        }
+        length += episode.trajectory.length();
+        total += total_return(episode.trajectory);
+        sound += 1;
     }
-    result.mean_length /= count;  // once: whole lengths give exact means
-    result.mean_return /= count;
+    result.mean_length = length / sound;  // once: whole lengths give exact means
+    result.mean_return = total / sound;
     return result;
 }
 
@@ -985,8 +1046,8 @@ namespace fs = std::filesystem;
 
 constexpr const char* progress_header =
     "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
-    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted\n";
-constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions\n";
+    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,physics\n";
+constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions,physics\n";
 
 struct Saver {
     static constexpr bool loading = false;
@@ -1144,6 +1205,156 @@ std::string csv_line(const std::vector<std::string>& fields) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// What differs between the grid world and the MuJoCo tasks: how they are made, their first data, the score of a return,
+// and what their figures need.
+
+// The place of a setting's word among an enumeration's names.
+template <size_t N>
+int choice(const std::array<const char*, N>& names, const std::string& name) {
+    return static_cast<int>(std::find(names.begin(), names.end(), name) - names.begin());
+}
+
+GridWorld make_grid_world(const Settings& settings) {
+    GridWorld world;
+    world.edge = static_cast<EdgeRule>(choice(edge_rule_names, settings.edge));
+    world.encoding = static_cast<StateEncoding>(choice(state_encoding_names, settings.state_encoding));
+    return world;
+}
+
+// Gives f the task's environment. Errors: mujoco.absent in a program built without the library.
+template <class F>
+void with_environment(const Settings& settings, F&& f) {
+    if (settings.task == "gridworld") return f(make_grid_world(settings));
+#ifdef WODTEM_MUJOCO
+    f(MujocoEnvironment(*find_mujoco_task(settings.task),
+                        static_cast<Physics>(choice(physics_names, settings.physics))));
+#else
+    fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s",
+         settings.task.c_str(), mujoco_advice);
+#endif
+}
+
+std::string physics_text(const Settings& settings) {
+    return settings.task == "gridworld" ? "grid world" : settings.physics + " on MuJoCo " + settings.mujoco;
+}
+
+std::vector<Trajectory> make_data_set(const Settings& settings, const GridWorld& world) {
+    std::vector<Trajectory> trajectories =
+        collect_data_set(world, static_cast<Behaviour>(choice(behaviour_names, settings.behaviour)),
+                         static_cast<uint32_t>(settings.data_seed), static_cast<int>(settings.data_trajectories));
+    const EnvironmentSpec spec = world.spec();
+    for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
+    return trajectories;
+}
+
+double score_of(const GridWorld&, double total_return) { return total_return; }
+std::string score_text(const GridWorld&, double) { return ""; }  // the return is the score
+
+void save_paths(const std::vector<GridWorld>&, const Evaluation&, const RunFolder&) {}
+
+// The learned policy's distribution over moves in every cell, at the start of an evaluation: [36][8].
+std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
+    SequenceBatch batch;
+    for (world.cell = 0; world.cell < grid_cells; ++world.cell) {
+        std::vector<float> state(static_cast<size_t>(run.agent.spec.state_dim));
+        world.observe(state.data());
+        batch.lengths.push_back(1);
+        batch.timesteps.push_back(0);
+        batch.returns_to_go.push_back(static_cast<float>(run.agent.settings.g_eval * run.agent.settings.reward_scale));
+        append_normalised(batch.states, run.agent.normaliser, state.data());
+        batch.actions.resize(batch.actions.size() + grid_moves);
+    }
+    run.acting.reset();
+    const Policy<float> policy = forward(run.acting, run.agent.model, batch, Ask::last_state);
+    std::vector<std::vector<float>> probabilities(grid_cells);
+    for (size_t i = 0; i < policy.mean.size(); ++i)
+        probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
+    return probabilities;
+}
+
+// Shares of the moves made in the start cell.
+std::vector<double> moves_at_start(const std::vector<Trajectory>& trajectories, GridWorld world, int state_dim) {
+    std::vector<float> start(static_cast<size_t>(state_dim));
+    world.cell = grid_start;
+    world.observe(start.data());
+    std::vector<double> shares(grid_moves);
+    double visits = 0;
+    for (const Trajectory& trajectory : trajectories)
+        for (size_t t = 0; t < trajectory.actions.size(); ++t)
+            if (std::equal(start.begin(), start.end(),
+                           trajectory.states.begin() + static_cast<ptrdiff_t>(t * start.size())))
+                shares[static_cast<size_t>(trajectory.actions[t])] += 1, visits += 1;
+    for (double& share : shares) share /= std::max(1.0, visits);
+    return shares;
+}
+
+void save_results(Run& run, const GridWorld& world, const RunFolder& folder) {
+    const std::vector<std::vector<float>> policy = policy_by_cell(run, world);
+    std::string cells = "row,column", start = "move,learned,offline,online\n";
+    for (const GridMove& move : grid_move_table) cells += std::string(",") + move.name;
+    cells += "\n";
+    for (int cell = 0; cell < grid_cells; ++cell) {
+        std::vector<std::string> fields = {std::to_string(cell / grid_size), std::to_string(cell % grid_size)};
+        for (const float p : policy[static_cast<size_t>(cell)]) fields.push_back(number_text(p));
+        cells += csv_line(fields);
+    }
+    const std::vector<double> offline =
+        moves_at_start(make_data_set(run.agent.settings, world), world, run.agent.spec.state_dim);
+    const std::vector<double> online = moves_at_start(run.replay.trajectories, world, run.agent.spec.state_dim);
+    for (size_t move = 0; move < grid_moves; ++move)
+        start += csv_line({grid_move_table[move].name, number_text(policy[grid_start][move]),
+                           number_text(offline[move]), run.progress.online != 0 ? number_text(online[move]) : "nan"});
+    write_file_atomic(folder.file("policy.csv"), cells);
+    write_file_atomic(folder.file("start_actions.csv"), start);
+}
+
+#ifdef WODTEM_MUJOCO
+
+// Uniformly random actions. A trajectory that the engine spoils is no data: the next one takes its place.
+std::vector<Trajectory> make_data_set(const Settings& settings, MujocoEnvironment environment) {
+    const EnvironmentSpec spec = environment.spec();
+    std::vector<Trajectory> trajectories;
+    for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
+        if (auto trajectory = random_trajectory(environment, static_cast<uint32_t>(settings.data_seed), number)) {
+            relabel(*trajectory, spec.state_dim, spec.action_dim, settings.gamma);
+            trajectories.push_back(std::move(*trajectory));
+        }
+    return trajectories;
+}
+
+double score_of(const MujocoEnvironment& environment, double total_return) {
+    return normalised_score(*environment.task, total_return);
+}
+std::string score_text(const MujocoEnvironment& environment, double total_return) {
+    return ", normalised score " + number_text(static_cast<float>(score_of(environment, total_return)));
+}
+
+// The ways of the latest evaluation's episodes through a maze, the last state too; without those that were spoiled.
+void save_paths(const std::vector<MujocoEnvironment>& environments, const Evaluation& evaluation,
+                const RunFolder& folder) {
+    if (!environments[0].task->maze) return;
+    std::string text = "episode,step,goal_x,goal_y,x,y\n";
+    size_t sound = 0;
+    for (size_t i = 0; i < evaluation.episodes.size(); ++i) {
+        if (!evaluation.episodes[i].problem.empty()) continue;
+        const std::string number = std::to_string(sound++);
+        const std::array<double, 2> goal = environments[i].goal;
+        const Episode& episode = evaluation.episodes[i];
+        const size_t length = episode.trajectory.rewards.size(), state_dim = episode.state.size();
+        for (size_t t = 0; t <= length; ++t) {
+            const float* state = t < length ? &episode.trajectory.states[t * state_dim] : episode.state.data();
+            text += csv_line({number, std::to_string(t), number_text(goal[0]), number_text(goal[1]),
+                              number_text(state[0]), number_text(state[1])});
+        }
+    }
+    write_file_atomic(folder.file("paths.csv"), text);
+}
+
+void save_results(Run&, const MujocoEnvironment&, const RunFolder&) {}
+
+#endif
+
+// ---------------------------------------------------------------------------------------------------------------------
 // What a person sees while it runs: a bar on a terminal, a line for each tenth of the way otherwise. To stderr.
 
 struct Console {
@@ -1223,7 +1434,7 @@ volatile std::sig_atomic_t stop_requested = 0;
 // What a phase needs besides the state: where to write, and whom to tell.
 template <class Environment>
 struct Session {
-    Environment environment;
+    std::vector<Environment> environments;  // as many as an evaluation plays side by side
     RunFolder folder;
     Console console;
     double checkpoint_every = 30;  // seconds; when it falls changes nothing but what a kill costs
@@ -1262,7 +1473,8 @@ template <class Environment>
 void evaluate_and_record(Run& run, Session<Environment>& session) {
     Progress& p = run.progress;
     const Evaluation evaluation =
-        evaluate(run, session.environment, p.evaluations, static_cast<int>(run.agent.settings.eval_episodes));
+        evaluate(run, session.environments, p.evaluations, static_cast<int>(run.agent.settings.eval_episodes));
+    save_paths(session.environments, evaluation, session.folder);
     p.eval_length = evaluation.mean_length;
     p.eval_return = evaluation.mean_return;
     const double learning_rate =
@@ -1271,21 +1483,32 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
     const auto mean = [](double sum, double count) {
         return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");  // seven digits will do
     };
-    const std::string line =
-        csv_line({p.online != 0 ? "online" : "offline", std::to_string(p.updates), std::to_string(p.interactions),
-                  std::to_string(p.episodes), number_text(learning_rate), mean(p.loss, p.summed_updates),
-                  mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
-                  run.constrains_entropy() ? number_text(run.temperature.lambda()) : "nan",
-                  mean(p.gradient_norm, p.summed_updates), mean(p.short_pairs, run.remembers() ? p.pairs : 0),
-                  mean(p.unmatched_pairs, run.remembers() ? p.pairs : 0), std::to_string(run.memory.size()),
-                  number_text(p.eval_length), number_text(p.eval_return), number_text(p.eval_return),
-                  mean(p.rollout_length, p.rollouts), mean(p.rollout_return, p.rollouts), number_text(p.matched),
-                  number_text(p.evicted)});
+    const std::string line = csv_line({p.online != 0 ? "online" : "offline",
+                                       std::to_string(p.updates),
+                                       std::to_string(p.interactions),
+                                       std::to_string(p.episodes),
+                                       number_text(learning_rate),
+                                       mean(p.loss, p.summed_updates),
+                                       mean(p.entropy, run.constrains_entropy() ? p.summed_updates : 0),
+                                       run.constrains_entropy() ? number_text(run.temperature.lambda()) : "nan",
+                                       mean(p.gradient_norm, p.summed_updates),
+                                       mean(p.short_pairs, run.remembers() ? p.pairs : 0),
+                                       mean(p.unmatched_pairs, run.remembers() ? p.pairs : 0),
+                                       std::to_string(run.memory.size()),
+                                       number_text(p.eval_length),
+                                       number_text(p.eval_return),
+                                       number_text(score_of(session.environments[0], p.eval_return)),
+                                       mean(p.rollout_length, p.rollouts),
+                                       mean(p.rollout_return, p.rollouts),
+                                       number_text(p.matched),
+                                       number_text(p.evicted),
+                                       number_text(p.dropped),
+                                       physics_text(run.agent.settings)});
     append_line(session.folder.file("progress.csv"), line, p.progress_bytes, p.progress_crc);
     p.evaluations += 1;
     p.next_evaluation = p.episodes + static_cast<uint64_t>(run.agent.settings.eval_every);
     p.loss = p.entropy = p.gradient_norm = p.summed_updates = p.pairs = p.short_pairs = p.unmatched_pairs = 0;
-    p.rollout_length = p.rollout_return = p.rollouts = p.matched = p.evicted = 0;
+    p.rollout_length = p.rollout_return = p.rollouts = p.matched = p.evicted = p.dropped = 0;
 }
 
 // WODTEM sec. IV-B.3, Fig. 2: offline training on D_offline. The table has taken in every trajectory of it before.
@@ -1304,20 +1527,21 @@ void offline_phase(Run& run, Session<Environment>& session) {
 template <class Environment>
 void interact(Run& run, Session<Environment>& session) {
     Progress& p = run.progress;
-    std::vector<Trajectory> episodes =
-        rollout(run, session.environment, Act::sample, run.agent.settings.g_online, p.episodes, 1);
-    Trajectory& episode = episodes[0];
+    std::vector<Episode> episodes =
+        rollout(run, session.environments, Act::sample, run.agent.settings.g_online, p.episodes, 1);
+    Trajectory& episode = episodes[0].trajectory;
     p.episodes += 1;
     p.interactions += static_cast<uint64_t>(episode.length());
+    if (!episodes[0].problem.empty()) return report_dropped(run, episodes[0], "an online");
     p.rollouts += 1;
     p.rollout_length += episode.length();
     p.rollout_return += total_return(episode);
     std::string moves;
     for (size_t t = 0; run.agent.spec.moves > 0 && t < episode.actions.size(); ++t)
         moves += static_cast<char>('0' + static_cast<int>(episode.actions[t]));
-    const std::string line =
-        csv_line({std::to_string(p.episodes), std::to_string(p.interactions), std::to_string(episode.length()),
-                  number_text(total_return(episode)), episode.terminated ? "1" : "0", moves});
+    const std::string line = csv_line({std::to_string(p.episodes), std::to_string(p.interactions),
+                                       std::to_string(episode.length()), number_text(total_return(episode)),
+                                       episode.terminated ? "1" : "0", moves, physics_text(run.agent.settings)});
     append_line(session.folder.file("episodes.csv"), line, p.episodes_bytes, p.episodes_crc);
     remember(run, episode);
     run.replay.add(std::move(episode));
@@ -1350,87 +1574,6 @@ void online_phase(Run& run, Session<Environment>& session) {
         interact(run, session);
         checkpoint_if_due(run, session);
     }
-}
-
-// ---------------------------------------------------------------------------------------------------------------------
-// The grid world's side: environment and data set from settings, and the results that its figures need.
-
-// The place of a setting's word among an enumeration's names.
-template <size_t N>
-int choice(const std::array<const char*, N>& names, const std::string& name) {
-    return static_cast<int>(std::find(names.begin(), names.end(), name) - names.begin());
-}
-
-GridWorld make_environment(const Settings& settings) {
-    GridWorld world;
-    world.edge = static_cast<EdgeRule>(choice(edge_rule_names, settings.edge));
-    world.encoding = static_cast<StateEncoding>(choice(state_encoding_names, settings.state_encoding));
-    return world;
-}
-
-std::vector<Trajectory> make_data_set(const Settings& settings, const GridWorld& world) {
-    std::vector<Trajectory> trajectories =
-        collect_data_set(world, static_cast<Behaviour>(choice(behaviour_names, settings.behaviour)),
-                         static_cast<uint32_t>(settings.data_seed), static_cast<int>(settings.data_trajectories));
-    const EnvironmentSpec spec = world.spec();
-    for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
-    return trajectories;
-}
-
-// The learned policy's distribution over moves in every cell, at the start of an evaluation: [36][8].
-std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
-    SequenceBatch batch;
-    for (world.cell = 0; world.cell < grid_cells; ++world.cell) {
-        std::vector<float> state(static_cast<size_t>(run.agent.spec.state_dim));
-        world.observe(state.data());
-        batch.lengths.push_back(1);
-        batch.timesteps.push_back(0);
-        batch.returns_to_go.push_back(static_cast<float>(run.agent.settings.g_eval * run.agent.settings.reward_scale));
-        append_normalised(batch.states, run.agent.normaliser, state.data());
-        batch.actions.resize(batch.actions.size() + grid_moves);
-    }
-    run.acting.reset();
-    const Policy<float> policy = forward(run.acting, run.agent.model, batch, Ask::last_state);
-    std::vector<std::vector<float>> probabilities(grid_cells);
-    for (size_t i = 0; i < policy.mean.size(); ++i)
-        probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
-    return probabilities;
-}
-
-// Shares of the moves made in the start cell.
-std::vector<double> moves_at_start(const std::vector<Trajectory>& trajectories, GridWorld world, int state_dim) {
-    std::vector<float> start(static_cast<size_t>(state_dim));
-    world.cell = grid_start;
-    world.observe(start.data());
-    std::vector<double> shares(grid_moves);
-    double visits = 0;
-    for (const Trajectory& trajectory : trajectories)
-        for (size_t t = 0; t < trajectory.actions.size(); ++t)
-            if (std::equal(start.begin(), start.end(),
-                           trajectory.states.begin() + static_cast<ptrdiff_t>(t * start.size())))
-                shares[static_cast<size_t>(trajectory.actions[t])] += 1, visits += 1;
-    for (double& share : shares) share /= std::max(1.0, visits);
-    return shares;
-}
-
-void save_grid_results(Run& run, const GridWorld& world, const RunFolder& folder) {
-    const std::vector<std::vector<float>> policy = policy_by_cell(run, world);
-    std::string cells = "row,column", start = "move,learned,offline,online\n";
-    for (const GridMove& move : grid_move_table) cells += std::string(",") + move.name;
-    cells += "\n";
-    for (int cell = 0; cell < grid_cells; ++cell) {
-        std::vector<std::string> fields = {std::to_string(cell / grid_size), std::to_string(cell % grid_size)};
-        for (const float p : policy[static_cast<size_t>(cell)]) fields.push_back(number_text(p));
-        cells += csv_line(fields);
-    }
-    const std::vector<double> offline =
-        moves_at_start(make_data_set(run.agent.settings, world), world, run.agent.spec.state_dim);
-    const std::vector<double> online = moves_at_start(run.replay.trajectories, world, run.agent.spec.state_dim);
-    for (size_t move = 0; move < grid_moves; ++move)
-        start += csv_line({grid_move_table[move].name, number_text(policy[grid_start][move]),
-                           number_text(offline[move]), run.progress.online != 0 ? number_text(online[move]) : "nan"});
-    write_file_atomic(folder.file("policy.csv"), cells);
-    write_file_atomic(folder.file("start_actions.csv"), start);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1480,8 +1623,11 @@ struct TrainOptions {
     double checkpoint_every = 30;
 };
 
-void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
-    Session<GridWorld> session{make_environment(settings), {path}, {}, options.checkpoint_every};
+template <class Environment>
+void train_in(const Environment& environment, const Settings& settings, const std::string& path,
+              const TrainOptions& options) {
+    Session<Environment> session{
+        {static_cast<size_t>(settings.eval_episodes), environment}, {path}, {}, options.checkpoint_every};
     session.console.label = settings.method + " " + std::to_string(settings.seed);
     std::error_code problem;
     fs::create_directories(path, problem);
@@ -1494,13 +1640,13 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
         return;
     }
     Compute compute(choose_kernel(options.kernel), options.threads);
-    Run run(compute, settings, session.environment.spec());
+    Run run(compute, settings, environment.spec());
     if (fs::exists(session.folder.file("checkpoint.safetensors"))) {
         load_checkpoint(run, session.folder);
         std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(),
                      static_cast<unsigned long long>(run.progress.updates));
     } else {
-        begin_run(run, make_data_set(settings, session.environment));
+        begin_run(run, make_data_set(settings, environment));
         Progress& p = run.progress;
         if (fs::exists(session.folder.file("progress.csv")))
             std::fprintf(stderr, "%s: no checkpoint, starting anew\n", path.c_str());
@@ -1513,13 +1659,18 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     if (settings.online_steps > 0) online_phase(run, session);
     for (const char* log : {"progress.csv", "episodes.csv"}) AppendFile(session.folder.file(log)).sync();
     save_model(run, session.folder.file("model.safetensors"));
-    save_grid_results(run, session.environment, session.folder);
+    save_results(run, environment, session.folder);
     write_file_atomic(session.folder.file("finished"), "");
     remove_checkpoint(session.folder);
-    std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s\n", path.c_str(),
+    std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s%s\n", path.c_str(),
                 static_cast<unsigned long long>(run.progress.updates),
                 static_cast<unsigned long long>(run.progress.interactions),
-                number_text(run.progress.eval_length).c_str(), number_text(run.progress.eval_return).c_str());
+                number_text(run.progress.eval_length).c_str(), number_text(run.progress.eval_return).c_str(),
+                score_text(environment, run.progress.eval_return).c_str());
+}
+
+void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
+    with_environment(settings, [&](const auto& environment) { train_in(environment, settings, path, options); });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1549,9 +1700,11 @@ struct Command {
 };
 
 const Option method_option = {"--method", "NAME", "wodtem", "dt, odt or wodtem"};
-const Option preset_option = {"--preset", "NAME", "small", "paper: Table I as printed; small: a narrower network"};
+const Option preset_option = {"--preset", "NAME", "small", "paper: Tables I and II as printed; small: less of it"};
 const Option seed_option = {"--seed", "N", "", "seed of everything but the data set; default 0"};
 const Option seeds_option = {"--seeds", "A-B", "", "several seeds, one after the other"};
+const Option physics_option = {"--physics", "NAME", "",
+                               "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"};
 const Option set_option = {"--set", "NAME=VALUE", "",
                            "any setting (see `wodtem info` of a run's model); may be repeated"};
 const Option kernel_option = {"--kernel", "NAME", "auto",
@@ -1598,6 +1751,12 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
     Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
     settings.seed = seed;
     settings.arithmetic = choose_kernel(arguments["--kernel"]).fused ? "fused" : "plain";
+    if (settings.task != "gridworld") {
+        settings.mujoco = mujoco_version();
+        if (settings.method != "dt")
+            set_from(settings, "offline_updates", "0", "there is no data set yet: the online phase alone");
+    }
+    if (!arguments["--physics"].empty()) set_from(settings, "physics", arguments["--physics"], "command line");
     std::set<std::string> seen;
     for (const std::string& assignment : arguments.assignments) {
         const size_t equals = assignment.find('=');
@@ -1605,10 +1764,8 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
             fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
         const std::string name = assignment.substr(0, equals);
         const std::string row = setting_row(name).name;
-        for (const char* fixed : {"task", "method", "preset", "seed", "arithmetic"})
-            if (row == fixed)
-                fail("usage.setting", "%s is not given by --set; use its own argument (see wodtem train --help)",
-                     fixed);
+        for (const char* fixed : {"task", "method", "preset", "seed", "arithmetic", "mujoco"})
+            if (row == fixed) fail("usage.setting", "%s is not given by --set; see wodtem train --help", fixed);
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
     }
@@ -1649,47 +1806,137 @@ void command_train(const Arguments& arguments) {
     }
 }
 
-struct LoadedModel {
-    Settings settings;
-    GridWorld environment;
-    std::unique_ptr<Compute> compute;
-    std::unique_ptr<Run> run;
-};
-
 // `given`: a model file, or a run's folder.
-LoadedModel open_model(const std::string& given, const Arguments& arguments) {
+TensorFile open_model(const std::string& given) {
     const std::string path = fs::is_directory(given) ? given + "/model.safetensors" : given;
-    const TensorFile file = read_safetensors(path);
+    TensorFile file = read_safetensors(path);
     const auto format = file.metadata.find("format");
     if (format == file.metadata.end() || format->second != "wodtem model 1")
         fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
-    LoadedModel model;
-    model.settings = settings_from_text(file.text("settings"), path);
-    const int64_t weights = 12 * model.settings.layers * model.settings.width * model.settings.width;
-    if (model.settings.width % model.settings.heads != 0 ||
-        static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
+    const Settings settings = settings_from_text(file.text("settings"), path);
+    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
+    if (settings.width % settings.heads != 0 || static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
         fail("model.settings", "%s: does not hold the %lld weights and more that its own settings call for",
              path.c_str(), static_cast<long long>(weights));
-    model.environment = make_environment(model.settings);
-    model.compute = std::make_unique<Compute>(choose_kernel(arguments["--kernel"]), thread_count(arguments));
-    model.run = std::make_unique<Run>(*model.compute, model.settings, model.environment.spec());
-    load_model(*model.run, file);
-    return model;
+    return file;
 }
 
-void command_eval(const Arguments& arguments) {
-    LoadedModel model = open_model(arguments.words[0], arguments);
-    const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 1000000));
-    const Evaluation evaluation = evaluate(*model.run, model.environment, 0, count);
-    std::printf("%s, %s, seed %lld: mean length %s, mean return %s over %d episode%s\n", model.settings.task.c_str(),
-                model.settings.method.c_str(), static_cast<long long>(model.settings.seed),
-                number_text(evaluation.mean_length).c_str(), number_text(evaluation.mean_return).c_str(), count,
-                count == 1 ? "" : "s");
+template <class Environment>
+void evaluate_model(const Environment& environment, const Settings& settings, const TensorFile& file,
+                    const Arguments& arguments) {
+    const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 10000));
+    Compute compute(choose_kernel(arguments["--kernel"]), thread_count(arguments));
+    Run run(compute, settings, environment.spec());
+    load_model(run, file);
+    std::vector<Environment> environments(static_cast<size_t>(count), environment);
+    const Evaluation evaluation = evaluate(run, environments, 0, count);
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s over %d episode%s (%s)\n", settings.task.c_str(),
+                settings.method.c_str(), static_cast<long long>(settings.seed),
+                number_text(evaluation.mean_length).c_str(), number_text(evaluation.mean_return).c_str(),
+                score_text(environment, evaluation.mean_return).c_str(), count, count == 1 ? "" : "s",
+                physics_text(settings).c_str());
+    if (run.agent.spec.moves == 0) return;
     std::printf("first episode:");
-    for (const float move : evaluation.episodes[0].actions)
+    for (const float move : evaluation.episodes[0].trajectory.actions)
         std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
     std::printf("\n");
 }
+
+void command_eval(const Arguments& arguments) {
+    const TensorFile file = open_model(arguments.words[0]);
+    const Settings settings = settings_from_text(file.text("settings"), file.path);
+    with_environment(settings,
+                     [&](const auto& environment) { evaluate_model(environment, settings, file, arguments); });
+}
+
+// ----- trace -----
+
+// What a line of a trace's input asks for.
+struct TraceLine {
+    size_t number;
+    std::string text;
+
+    [[noreturn]] void refuse(const std::string& expected) const {
+        fail("trace.line", "line %zu of the input is \"%s\"; expected %s", number,
+             text.size() > 60 ? (text.substr(0, 60) + "...").c_str() : text.c_str(), expected.c_str());
+    }
+
+    // The numbers after `keyword`, as many as `count`.
+    std::vector<double> numbers(const std::string& keyword, int count, const std::string& expected) const {
+        if (!text.starts_with(keyword)) refuse(expected);
+        std::vector<double> values;
+        for (const std::string& part : split(text.substr(keyword.size()), ','))
+            values.push_back(to_number(part).value_or(NAN));
+        if (values.size() != static_cast<size_t>(count) ||
+            std::any_of(values.begin(), values.end(), [](double x) { return std::isnan(x); }))
+            refuse(expected);
+        return values;
+    }
+};
+
+void print_numbers(std::string line, const std::vector<double>& values) {
+    for (const double value : values) {
+        char text[40];
+        std::snprintf(text, sizeof text, "%.17g", value);
+        line += (line.empty() ? "" : ",") + std::string(text);
+    }
+    std::printf("%s\n", line.c_str());
+}
+
+#ifdef WODTEM_MUJOCO
+// Steps the environment as the lines of `input` say: `init qpos,...` and `init qvel,...` start a segment, `goal,X,Y`
+// moves a maze's goal from there on, any other line is an action. Neither done nor a time limit ends anything.
+void trace(MujocoEnvironment environment, std::istream& input) {
+    const mjModel& model = *environment.model;
+    const std::string finite = " finite numbers, separated by commas";
+    const std::string an_init = "init qpos, and " + std::to_string(model.nq) + finite,
+                      a_velocity = "init qvel, and " + std::to_string(model.nv) + finite,
+                      a_goal = "goal, and 2" + finite,
+                      an_action =
+                          "an action, " + std::to_string(environment.task->action_dim) + finite + ", or " + an_init;
+    std::vector<double> qpos;
+    bool started = false;
+    TraceLine line{0, ""};
+    while (++line.number, std::getline(input, line.text)) {
+        if (line.text.starts_with("goal")) {
+            if (!environment.task->maze) line.refuse("no goal: " + std::string(environment.task->name) + " is no maze");
+            const std::vector<double> goal = line.numbers("goal,", 2, a_goal);
+            environment.goal = {goal[0], goal[1]};
+        } else if (!qpos.empty()) {
+            environment.start(qpos, line.numbers("init qvel,", model.nv, a_velocity));
+            print_numbers("init obs", environment.observation);
+            qpos.clear();
+            started = true;
+        } else if (line.text.starts_with("init")) {
+            qpos = line.numbers("init qpos,", model.nq, an_init);
+        } else {
+            if (!started) line.refuse(an_init);
+            const std::vector<double> action = line.numbers("", environment.task->action_dim, an_action);
+            const Step step = environment.advance(action);
+            std::vector<double> row = environment.observation;
+            row.push_back(step.reward);
+            row.push_back(step.terminated ? 1 : 0);
+            print_numbers("", row);
+        }
+    }
+    if (!qpos.empty()) line.refuse(a_velocity);
+}
+#endif
+
+void command_trace(const Arguments& arguments) {
+    Settings settings = default_settings(arguments.words[0], "wodtem", "paper");
+    if (!arguments["--physics"].empty()) set_setting(settings, "physics", arguments["--physics"]);
+    settings.mujoco = mujoco_version();
+    check_together(settings);
+    if (settings.task == "gridworld") fail("usage.task", "trace steps the MuJoCo tasks; gridworld is a table of moves");
+    std::setvbuf(stdout, nullptr, _IOLBF, 0);  // another program may be waiting for each answer
+    with_environment(settings, [&](const auto& environment) {
+        std::fprintf(stderr, "%s, %s\n", settings.task.c_str(), physics_text(settings).c_str());
+        if constexpr (requires { environment.model; }) trace(environment, std::cin);
+    });
+}
+
+// -----
 
 void command_report(const Arguments& arguments) {
     const std::string out = arguments["--out"];
@@ -1698,19 +1945,26 @@ void command_report(const Arguments& arguments) {
 }
 
 // How long an update takes here, times how many there will be: offline_updates, and updates_per_iteration for each
-// episode. The episodes are not known beforehand; the means of preset small over seeds 0 to 4 stand in (README.md).
+// episode. The episodes are not known beforehand: on the grid world the means of preset small over seeds 0 to 4 stand in
+// (README.md), elsewhere episodes that use up the time limit; shorter ones are more.
 double estimated_seconds(const Settings& settings) {
-    Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
-    const GridWorld environment = make_environment(settings);
-    Run run(compute, settings, environment.spec());
-    begin_run(run, make_data_set(settings, environment));
-    update(run);
-    const auto begin = Console::Clock::now();
-    for (int i = 0; i < 3; ++i) update(run);
-    const double update_seconds = Console::seconds_between(begin, Console::Clock::now()) / 3;
-    const double episodes = settings.method == "dt" ? 0 : settings.method == "odt" ? 498 : 2041;
-    return update_seconds * (static_cast<double>(settings.offline_updates) +
-                             episodes * static_cast<double>(settings.updates_per_iteration));
+    double seconds = 0;
+    with_environment(settings, [&](const auto& environment) {
+        Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
+        Run run(compute, settings, environment.spec());
+        begin_run(run, make_data_set(settings, environment));
+        update(run);
+        const auto begin = Console::Clock::now();
+        for (int i = 0; i < 3; ++i) update(run);
+        const double update_seconds = Console::seconds_between(begin, Console::Clock::now()) / 3;
+        double episodes =
+            static_cast<double>(settings.online_steps) / static_cast<double>(environment.spec().max_episode_steps);
+        if (settings.task == "gridworld")
+            episodes = settings.method == "dt" ? 0 : settings.method == "odt" ? 498 : 2041;
+        seconds = update_seconds * (static_cast<double>(settings.offline_updates) +
+                                    episodes * static_cast<double>(settings.updates_per_iteration));
+    });
+    return seconds;
 }
 
 void command_sweep(const Arguments& arguments) {
@@ -1787,13 +2041,16 @@ void command_tasks(const Arguments& arguments) {
         return;
     }
     const EnvironmentSpec spec = GridWorld{}.spec();
-    std::printf(
-        "gridworld: %d state numbers, %d moves, at most %d steps; data set: 500 trajectories of a fixed policy, made on the spot\n",
-        spec.state_dim, spec.moves, spec.max_episode_steps);
-    for (const std::string& task : split(task_names, '|'))
-        if (task != "gridworld")
-            std::printf("%s: settings only (wodtem tasks %s); its environment is not part of this version\n",
-                        task.c_str(), task.c_str());
+    std::printf("%-30s %3d state numbers, %d moves, at most %d steps; data set: a fixed policy's, made on the spot\n",
+                "gridworld", spec.state_dim, spec.moves, spec.max_episode_steps);
+    for (const std::string& id : split(task_names, '|'))
+        if (const MujocoTask* task = find_mujoco_task(id))
+            std::printf(
+                "%-30s %3d state numbers, %d action numbers, at most %d steps; score 0 is a return of %s, 100 %s\n",
+                id.c_str(), task->state_dim, task->action_dim, task->max_episode_steps,
+                number_text(task->score_low).c_str(), number_text(task->score_high).c_str());
+    std::printf("MuJoCo: %s%s%s\n", mujoco_version().c_str(), mujoco_version() == "none" ? "; " : "",
+                mujoco_version() == "none" ? mujoco_advice : "");
 }
 
 #include "tests/bench.hpp"
@@ -1801,6 +2058,20 @@ void command_tasks(const Arguments& arguments) {
 void command_bench(const Arguments& arguments) {
     const Kernel& chosen = choose_kernel(arguments["--kernel"]);
     const int threads = thread_count(arguments);
+    const std::string what = arguments.words.empty() ? "updates" : arguments.words[0];
+    if (what != "updates" && what != "environments" && what != "random-policy")
+        fail("usage.words", "bench cannot measure \"%s\"; it is updates, environments or random-policy", what.c_str());
+    if (what != "updates") {
+#ifdef WODTEM_MUJOCO
+        std::printf("MuJoCo %s, uniformly random actions\n", mujoco_version().c_str());
+        if (what == "random-policy") return bench_random_policy(threads);
+        std::printf("one core, physics d4rl; medians of 25 rounds; overhead: beside the engine's calls alone\n");
+        for (const MujocoTask& task : mujoco_tasks) bench_environment(task);
+        return;
+#else
+        fail("mujoco.absent", "MuJoCo 2.2 was not there when this program was built; %s", mujoco_advice);
+#endif
+    }
     std::printf("medians and ranges; a product's share is of the peak measured just before and after it\n");
     for (const Kernel* kernel : kernels)
         if (kernel->supported() && (arguments["--kernel"] == "auto" || kernel == &chosen)) bench_products(*kernel);
@@ -1822,6 +2093,7 @@ const std::vector<Command>& commands() {
           seed_option,
           seeds_option,
           set_option,
+          physics_option,
           {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
           kernel_option,
           threads_option,
@@ -1834,6 +2106,13 @@ const std::vector<Command>& commands() {
          "evaluate a saved model; needs nothing else",
          {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option},
          command_eval},
+        {"trace",
+         "TASK",
+         1,
+         1,
+         "step a MuJoCo task from given states through given actions, to 17 digits",
+         {physics_option},
+         command_trace},
         {"report",
          "DIR...",
          1,
@@ -1853,10 +2132,10 @@ const std::vector<Command>& commands() {
          command_sweep},
         {"info", "FILE", 1, 1, "what is in a model or checkpoint: names, shapes, ranges, checksum", {}, command_info},
         {"bench",
-         "",
+         "[WHAT]",
          0,
-         0,
-         "the machine's peak, each kernel's share of it, update and look-up times",
+         1,
+         "updates: kernels beside the machine's peak, look-ups; environments: steps a second; random-policy",
          {kernel_option, threads_option},
          command_bench},
         {"tasks",
@@ -1884,6 +2163,14 @@ void print_help(const Command* command) {
         std::printf("  %-26s %s%s%s\n", left.c_str(), option.meaning, *option.fallback ? "; default " : "",
                     option.fallback);
     }
+    if (std::string(command->name) == "trace")
+        std::printf(
+            "\nStandard input, line by line:\n"
+            "  init qpos,...   with the next line starts a segment: mj_resetData, write both, mj_forward\n"
+            "  init qvel,...   answered by one line: init obs,...\n"
+            "  goal,X,Y        mazes: the goal from here on, in observed coordinates\n"
+            "  ...,...         an action as a policy gives it; answered by one line: obs...,reward,done\n"
+            "Nothing ends an episode but the next init.\n");
     if (std::string(command->name) == "train") {
         std::printf("\nSettings for --set, with the values of preset paper:\n");
         const Settings settings;

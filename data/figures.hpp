@@ -47,6 +47,7 @@ struct LineChart {
     std::vector<Reference> references;
     bool log_y = false;      // values that are not positive are left out
     double y_floor = -1e30;  // no value can lie below: bands are cut there
+    bool cut_x = false;      // the x axis ends with the data, not at the next tick
 };
 
 struct Bars {
@@ -73,6 +74,20 @@ struct GridPolicy {
     std::vector<Arrow> arrows;  // (rows, columns): the most likely action of each cell; row 0 on top
     Cell start, goal;
     std::vector<Cell> path;
+};
+
+struct Place {
+    double row, column;  // whole numbers: the middle of a cell
+};
+struct MazePath {
+    Place goal;
+    std::vector<Place> places;  // from the start to the end
+};
+struct MazePaths {
+    std::string title, map;  // map: rows from the top, each ended by a slash; 1: wall, all else is free
+    double goal_radius;      // cells
+    std::string goal_label;
+    std::vector<MazePath> paths;
 };
 
 struct Table {
@@ -342,6 +357,10 @@ inline std::string line_chart(const LineChart& chart) {
 
     svg::Axis y = chart.log_y ? svg::log_axis(y_low, y_high) : svg::linear_axis(y_low, y_high, 5);
     svg::Axis x = svg::linear_axis(x_low, x_high, 6);
+    if (chart.cut_x && x_low < x_high) {
+        x.high = x_high;
+        std::erase_if(x.ticks, [&](double tick) { return tick > x_high; });
+    }
     svg::Frame frame = svg::open_frame(y, chart.y_label);
     x.from = frame.left, x.to = frame.right, frame.end = frame.bottom + 22;
     for (const double tick : x.ticks) {
@@ -454,6 +473,16 @@ inline std::string arrow_mark(double x, double y, const Arrow& arrow, double siz
     return out + "\" fill=\"" + colour + "\"/></g>\n";
 }
 
+// Rows at the left, columns on top, from 0; `size` is the side of a cell.
+inline std::string cell_numbers(double left, double top, double size, int rows, int columns) {
+    std::string out;
+    for (int row = 0; row < rows; ++row)
+        out += svg::text(left - 10, top + size * (row + 0.5) + 4.5, std::to_string(row), "text-anchor=\"end\"");
+    for (int column = 0; column < columns; ++column)
+        out += svg::text(left + size * (column + 0.5), top - 9, std::to_string(column), "text-anchor=\"middle\"");
+    return out;
+}
+
 inline std::string grid_policy(const GridPolicy& policy) {
     svg::check_length(policy.arrows.size(), static_cast<size_t>(policy.rows * policy.columns), "arrows", policy.title);
     const double size = 480.0 / std::max({policy.rows, policy.columns, 1}), left = 48, top = 76;
@@ -480,10 +509,7 @@ inline std::string grid_policy(const GridPolicy& policy) {
                 marks += arrow_mark(x + size / 2, y + size / 2, arrow, size, svg::ink);
         }
     }
-    for (int row = 0; row < policy.rows; ++row)
-        marks += svg::text(left - 10, top + size * (row + 0.5) + 4.5, std::to_string(row), "text-anchor=\"end\"");
-    for (int column = 0; column < policy.columns; ++column)
-        marks += svg::text(left + size * (column + 0.5), top - 9, std::to_string(column), "text-anchor=\"middle\"");
+    marks += cell_numbers(left, top, size, policy.rows, policy.columns);
     badge(policy.start, "S", svg::hex(Colour::black));
     badge(policy.goal, "G", svg::hex(Colour::vermillion));
 
@@ -498,6 +524,123 @@ inline std::string grid_policy(const GridPolicy& policy) {
         x += 86;
     }
     return svg::open(right + 24, y + 56, policy.title) + marks + "</svg>\n";
+}
+
+// One colour for each of ten paths: Okabe and Ito's but black, three of Tol's that stand apart from them, grey.
+inline constexpr const char* path_colours[] = {"#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
+                                               "#56B4E9", "#332288", "#882255", "#999933", "#777777"};
+
+// A map of cells as a picture.
+struct MazeFrame {
+    int rows = 0, columns = 0;
+    std::vector<Cell> walls;
+    double size = 0, left = 48, top = 76;  // size: the side of a cell
+
+    explicit MazeFrame(const std::string& map) {
+        for (int column = 0; const char c : map) {
+            if (c == '1') walls.push_back({rows, column});
+            columns = std::max(columns, column + (c == '/' ? 0 : 1));
+            column = c == '/' ? 0 : column + 1;
+            rows += c == '/' ? 1 : 0;
+        }
+        size = std::min(600.0 / std::max(columns, 1), 480.0 / std::max(rows, 1));
+    }
+    // What lies outside is drawn on the edge.
+    double x(Place p) const { return left + size * (std::clamp(p.column, -0.5, columns - 0.5) + 0.5); }
+    double y(Place p) const { return top + size * (std::clamp(p.row, -0.5, rows - 0.5) + 0.5); }
+    double right() const { return left + size * columns; }
+    double bottom() const { return top + size * rows; }
+};
+
+inline bool drawable(Place p) { return svg::drawable(p.row) && svg::drawable(p.column); }
+
+inline double squared_distance(Place a, Place b) {
+    return (a.row - b.row) * (a.row - b.row) + (a.column - b.column) * (a.column - b.column);
+}
+
+// One line from place to place. Steps shorter than 0.02 cells are drawn together; the last place always counts.
+inline std::string maze_line(const MazeFrame& frame, const std::vector<Place>& places, const char* colour) {
+    std::string data;
+    const Place* before = nullptr;  // the latest place drawn; null: the line begins anew
+    for (size_t i = 0; i < places.size(); ++i) {
+        const Place& p = places[i];
+        const bool last = i + 1 == places.size() || !drawable(places[i + 1]);
+        if (!drawable(p)) {
+            before = nullptr;
+        } else if (!before || last || squared_distance(p, *before) >= 0.02 * 0.02) {
+            data += (before ? "" : "M ") + svg::number(frame.x(p)) + " " + svg::number(frame.y(p)) + " ";
+            before = &p;
+        }
+    }
+    if (data.empty()) return "";
+    return "<path d=\"" + data + "\" " + svg::stroke(colour, 2) +
+           " stroke-opacity=\"0.7\" stroke-linejoin=\"round\"/>\n";
+}
+
+inline std::string circle_mark(double x, double y, double radius, const std::string& style) {
+    return "<circle" + svg::attributes({{"cx", x}, {"cy", y}, {"r", radius}}) + " " + style + "/>\n";
+}
+
+inline std::string start_mark(double x, double y, const char* colour) {
+    return circle_mark(x, y, 5, std::string("fill=\"") + colour + "\" stroke=\"#FFFFFF\"");
+}
+
+inline std::string end_mark(double x, double y, const char* colour) {
+    std::string out;
+    for (const auto& [stroke, thickness] : {std::pair("#FFFFFF", 5.5), std::pair(colour, 3.0)})
+        for (const double slope : {1, -1})
+            out += svg::line(x - 5, y - 5 * slope, x + 5, y + 5 * slope, svg::stroke(stroke, thickness));
+    return out;
+}
+
+inline std::string maze_map(const MazeFrame& frame) {
+    std::string marks;
+    for (int row = 0; row <= frame.rows; ++row) {
+        const double y = frame.top + frame.size * row;
+        marks += svg::line(frame.left, y, frame.right(), y, svg::stroke(svg::grid, 1));
+    }
+    for (int column = 0; column <= frame.columns; ++column) {
+        const double x = frame.left + frame.size * column;
+        marks += svg::line(x, frame.top, x, frame.bottom(), svg::stroke(svg::grid, 1));
+    }
+    for (const Cell& wall : frame.walls)
+        marks += svg::rectangle(frame.left + frame.size * wall.column, frame.top + frame.size * wall.row, frame.size,
+                                frame.size, "fill=\"#C8C8C8\" stroke=\"#B0B0B0\"");
+    return marks + cell_numbers(frame.left, frame.top, frame.size, frame.rows, frame.columns);
+}
+
+// Starts and ends lie on top of all lines, lines on top of the goals. A goal that all paths share is drawn once;
+// otherwise each has its path's colour.
+inline std::string maze_paths(const MazePaths& maze) {
+    const MazeFrame frame(maze.map);
+    std::string goals, lines, ends;
+    const bool shared = std::all_of(maze.paths.begin(), maze.paths.end(), [&](const MazePath& path) {
+        return path.goal.row == maze.paths[0].goal.row && path.goal.column == maze.paths[0].goal.column;
+    });
+    const std::string shared_goal = "fill=\"#FFF1B8\" stroke=\"#222222\" stroke-width=\"1.5\"";
+    for (size_t i = 0; i < maze.paths.size(); ++i) {
+        const MazePath& path = maze.paths[i];
+        const char* colour = path_colours[i % std::size(path_colours)];
+        if (drawable(path.goal) && svg::drawable(maze.goal_radius) && (!shared || i == 0))
+            goals += circle_mark(frame.x(path.goal), frame.y(path.goal), frame.size * maze.goal_radius,
+                                 shared ? shared_goal : svg::stroke(colour, 1.5));
+        lines += maze_line(frame, path.places, colour);
+        if (path.places.empty()) continue;
+        const Place &first = path.places.front(), &last = path.places.back();
+        if (drawable(first)) ends += start_mark(frame.x(first), frame.y(first), colour);
+        if (drawable(last)) ends += end_mark(frame.x(last), frame.y(last), colour);
+    }
+
+    const double y = frame.bottom() + 28;
+    double x = frame.left + 8;
+    const auto key = [&](const std::string& mark, const std::string& label) {
+        ends += mark + svg::text(x + 15, y + 4.5, label, "");
+        x += 15 + svg::text_width(label, 13) + 30;
+    };
+    key(start_mark(x, y, svg::faint_ink), "start");
+    key(end_mark(x, y, svg::faint_ink), "end");
+    key(circle_mark(x, y, 8, shared ? shared_goal : svg::stroke(svg::faint_ink, 1.5)), maze.goal_label);
+    return svg::open(frame.right() + 24, y + 28, maze.title) + maze_map(frame) + goals + lines + ends + "</svg>\n";
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -1,15 +1,17 @@
 // report.hpp: run folders in, tables and figures out: report.html (one file that needs nothing else), its figures as
-// SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); tasks other than the grid world get one
-// curve.
+// SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
+// length, and mazes the paths through them.
 //
 // Reads from each folder:  settings            lines `name = value    # source`; task, method, preset, seed are needed
 //                          progress.csv        one row per evaluation, the first at the end of the offline phase
 //                          episodes.csv        one row per online episode (not for DT)
 //                          finished            an empty file; without it the logs above count as far as they go
+//   mazes, if it is there: paths.csv           one row per state of the latest evaluation's episodes
 //   finished grid worlds:  policy.csv          probability of each move in each cell
 //                          start_actions.csv   share of each move at S: learned, D_offline, D_online (not for DT)
 // Promises: every number comes from these files or stands in a column marked as the paper's; equal folders give equal
-// bytes; seeds are averaged only if nothing but the seed was set differently; errors name file and line.
+// bytes; seeds are averaged only if nothing but the seed was set differently, and the physics were the same; errors
+// name file and line.
 // Leaves out: networks, statistics beyond mean and standard deviation, judging whether a difference matters.
 #pragma once
 
@@ -30,6 +32,7 @@
 #include <vector>
 
 #include "../gridworld.hpp"
+#include "../mujoco_env.hpp"
 #include "figures.hpp"
 #include "safetensors.hpp"
 
@@ -90,18 +93,27 @@ constexpr std::array<Method, 3> methods{{
 
 using MoveShares = std::array<double, grid_moves>;
 
+struct MazeEpisode {
+    double goal_x, goal_y;     // m, like x and y
+    std::vector<double> x, y;  // observed, from the first state to the last
+};
+
 struct Run {
     std::string folder;
     std::vector<Setting> settings;
     std::string task, preset;
     size_t method = 0;  // in method_names
     int64_t seed = 0;
+    const MujocoTask* mujoco_task = nullptr;  // null: the grid world, or a task of which we know the name alone
+    Physics physics = Physics::d4rl;          // with mujoco_task alone, like the next
+    std::string mujoco_version;
     bool finished = false;
     double so_far = 0;                                       // online interactions
     std::vector<double> interactions, length, total, score;  // of each evaluation; total: the return
     std::vector<double> episode_length, episode_return;      // of each online episode
     std::vector<MoveShares> policy;                          // [36], or empty
     std::array<std::vector<double>, 3> start_actions;        // learned, D_offline, D_online: [8] each, or empty
+    std::vector<MazeEpisode> paths;                          // of the latest evaluation in a maze, or empty
 
     const Method& about_method() const { return methods[method]; }
     bool offline_only() const { return method == 0; }
@@ -193,6 +205,43 @@ inline std::array<std::vector<double>, 3> read_start_actions(const std::string& 
             numbers(table, "online", path)};  // NaN if the online phase had no budget
 }
 
+// Within the map, or beside it by less than its own size. NaN is nowhere.
+inline bool near_maze(const MujocoTask& task, double x, double y) {
+    const std::string_view map = task.maze;
+    const auto rows = static_cast<double>(std::count(map.begin(), map.end(), '/'));
+    const auto columns = static_cast<double>(map.find('/'));
+    const MazePlace place = maze_place(task, x, y);
+    return place.row > -rows && place.row < 2 * rows && place.column > -columns && place.column < 2 * columns;
+}
+
+// Episodes count from 0, and in each of them its steps; its goal stays.
+inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const std::string& path) {
+    const Table table = parse_csv(read_file(path), path);
+    const std::vector<double> episode = numbers(table, "episode", path), goal_x = numbers(table, "goal_x", path),
+                              goal_y = numbers(table, "goal_y", path), x = numbers(table, "x", path),
+                              y = numbers(table, "y", path),
+                              step = numbers_within(table, "step", path, 0, task.max_episode_steps);
+    std::vector<MazeEpisode> out;
+    for (size_t i = 0; i < step.size(); ++i) {
+        if (step[i] == 0) out.push_back({goal_x[i], goal_y[i], {}, {}});
+        if (out.empty() || episode[i] != static_cast<double>(out.size() - 1) ||
+            step[i] != static_cast<double>(out.back().x.size()))
+            fail("report.order",
+                 "%s: line %zu: episode %g, step %g does not follow from the line before; both count up from 0",
+                 path.c_str(), i + 2, episode[i], step[i]);
+        for (const auto& [what, at_x, at_y] : {std::tuple("goal", goal_x[i], goal_y[i]), {"position", x[i], y[i]}})
+            if (!near_maze(task, at_x, at_y))
+                fail("report.range",
+                     "%s: line %zu: the %s (%g, %g) is nowhere near the maze of %s; remove the file to report without "
+                     "it",
+                     path.c_str(), i + 2, what, at_x, at_y, task.name);
+        if (goal_x[i] != out.back().goal_x || goal_y[i] != out.back().goal_y)
+            fail("report.goal", "%s: line %zu: the goal is not that of the episode's first line", path.c_str(), i + 2);
+        out.back().x.push_back(x[i]), out.back().y.push_back(y[i]);
+    }
+    return out;
+}
+
 // A run that has just begun may not have its logs yet.
 inline Table read_log(const Run& run, const std::string& path, const char* header) {
     return parse_csv(run.finished || std::filesystem::exists(path) ? read_file(path) : header, path);
@@ -229,6 +278,13 @@ inline Run read_run(const std::string& folder) {
     if (error != std::errc() || end != seed.data() + seed.size())
         fail("report.setting", "%s: seed is \"%s\", expected a whole number", path.c_str(), seed.c_str());
     run.finished = std::filesystem::exists(folder + "/finished");
+    run.mujoco_task = find_mujoco_task(run.task);
+    if (run.mujoco_task) {
+        run.physics = static_cast<Physics>(choice(run, "physics", needed_word(run, "physics"), physics_names));
+        run.mujoco_version = needed_word(run, "mujoco");
+        const std::string paths = folder + "/paths.csv";  // missing in a run that has just begun
+        if (run.mujoco_task->maze && std::filesystem::exists(paths)) run.paths = read_paths(*run.mujoco_task, paths);
+    }
     read_logs(run);
     if (run.task != "gridworld" || !run.finished) return run;
     run.policy = read_policy(folder + "/policy.csv");
@@ -419,14 +475,27 @@ inline std::string if_unfinished(const std::vector<Runs>& by_method, const char*
     return "";
 }
 
-// What the command line set beyond task, method, preset and seed: " --set width=64".
+// What the command line set beyond task, method, preset, seed and physics: " --set width=64".
 inline std::string other_options(const Run& run) {
     std::string out;
     for (const auto& [name, value, source] : run.settings) {
-        const bool named = name == "task" || name == "method" || name == "preset" || name == "seed";
+        const bool named =
+            name == "task" || name == "method" || name == "preset" || name == "seed" || name == "physics";
         if (source == "command line" && !named) out += " --set " + name + "=" + value;
     }
     return out;
+}
+
+// "physics d4rl on MuJoCo 2.2.2"
+inline std::string physics_of(const Run& run) {
+    return std::string("physics ") + physics_names[static_cast<size_t>(run.physics)] + " on MuJoCo " +
+           run.mujoco_version;
+}
+
+// "20,050"; "20,050–20,712" if they differ.
+inline std::string range_text(const std::vector<double>& values) {
+    const auto [low, high] = std::minmax_element(values.begin(), values.end());
+    return shown(*low, 0) + (*low < *high ? "–" + shown(*high, 0) : "");
 }
 
 // For a terminal: columns aligned to the right, the first to the left. Widths count characters, not bytes.
@@ -609,23 +678,118 @@ inline void add_gridworld(Part& part, const std::vector<Runs>& by_method, const 
         if (const Runs finished = only_finished(runs); !finished.empty()) add_grid(part, *finished[0], name);
 }
 
+inline bool ends_early(const MujocoTask& task) {
+    return task.rules != Rules::maze2d && task.rules != Rules::halfcheetah;
+}
+
+// What a section's numbers rest on.
+inline std::string about_physics(const Run& run) {
+    const MujocoTask& task = *run.mujoco_task;
+    const std::string limit = shown(task.max_episode_steps, 0) + " steps.";
+    return "All runs: " + physics_of(run) + ", masses and inertias as " +
+           (run.physics == Physics::d4rl ? "in MuJoCo up to 2.1.0, which made D4RL's data"
+                                         : "MuJoCo 2.2 computes them from the geometry") +
+           ". Score 0 is a mean return of " + shown(task.score_low, 2) + ", score 100 one of " +
+           shown(task.score_high, 2) + ". " +
+           (task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
+            : ends_early(task)           ? "An episode ends when the body leaves gym's healthy range, or after "
+                                         : "Every episode takes ") +
+           limit;
+}
+
+inline bool reached_goal(const MazeEpisode& episode) {
+    bool reached = false;
+    for (size_t t = 0; t < episode.x.size(); ++t)
+        reached = reached || std::hypot(episode.x[t] - episode.goal_x, episode.y[t] - episode.goal_y) <= goal_radius;
+    return reached;
+}
+
+constexpr size_t paths_drawn = 10;  // at most; more would hide each other
+
+inline MazePaths paths_on_map(const Run& run) {
+    const MujocoTask& task = *run.mujoco_task;
+    const auto place = [&](double x, double y) {
+        const MazePlace at = maze_place(task, x, y);
+        return Place{at.row, at.column};
+    };
+    MazePaths maze{run.task + ": paths of " + who(Runs{&run}),
+                   task.maze,
+                   goal_radius / maze_cell_length(task),
+                   "goal (radius " + svg::number(goal_radius) + " m)",
+                   {}};
+    for (size_t i = 0; i < std::min(run.paths.size(), paths_drawn); ++i) {
+        const MazeEpisode& episode = run.paths[i];
+        MazePath& path = maze.paths.emplace_back(place(episode.goal_x, episode.goal_y), std::vector<Place>{});
+        for (size_t t = 0; t < episode.x.size(); ++t) path.places.push_back(place(episode.x[t], episode.y[t]));
+    }
+    return maze;
+}
+
+// The latest evaluation of one run, in a maze.
+inline void add_paths(Part& part, const Run& run, const std::string& name) {
+    const bool ant = run.mujoco_task->rules == Rules::antmaze;
+    const auto reached = std::count_if(run.paths.begin(), run.paths.end(), reached_goal);
+    std::string caption = who(Runs{&run}) + (run.finished ? "" : ", unfinished") + ": its latest evaluation";
+    if (!run.interactions.empty()) caption += ", at " + shown(run.interactions.back(), 0) + " online interactions";
+    caption += ", " + physics_of(run) + ". " + std::to_string(reached) + " of " + std::to_string(run.paths.size()) +
+               " episodes came within " + svg::number(goal_radius) + " m of the goal" +
+               (ant ? ", which ended them; each has a goal of its own, circled in its colour."
+                    : " at some time. None ends there: the score counts the steps within that distance.");
+    if (run.paths.size() > paths_drawn) caption += " The first " + std::to_string(paths_drawn) + " are drawn.";
+    caption += std::string(" The maze as its map is printed, walls grey; x runs ") +
+               (ant ? "to the right and y downwards." : "downwards and y to the right.");
+    add_figure(part, name + "-paths-" + method_names[run.method], maze_paths(paths_on_map(run)), caption);
+}
+
+inline Table score_table(const std::vector<Runs>& by_method) {
+    Table table{{"Method", "Seeds", "Final normalised score", "Mean of last 10 scores", "Final return", "Final length",
+                 "Interactions"},
+                {}};
+    for (const Runs& runs : by_method) {
+        std::vector<double> score, ten, total, length, interactions;
+        for (const Run* run : runs) {
+            score.push_back(final_value(*run, &Run::score)), ten.push_back(last_ten(*run, &Run::score));
+            total.push_back(final_value(*run, &Run::total)), length.push_back(final_value(*run, &Run::length));
+            interactions.push_back(run->so_far);
+        }
+        table.rows.push_back({runs[0]->about_method().label, seed_count(runs), plus_minus(spread_of(score)),
+                              plus_minus(spread_of(ten)), plus_minus(spread_of(total)), plus_minus(spread_of(length)),
+                              range_text(interactions)});
+    }
+    return table;
+}
+
 // Any other task: scores where the runs have them, else returns.
 inline void add_other_task(Part& part, const std::vector<Runs>& by_method, const std::string& name) {
-    Table table{{"Method", "Seeds", "Final return", "Final score"}, {}};
+    const Run& any = *by_method.at(0)[0];
     bool scored = false;
-    for (const Runs& runs : by_method) {
-        std::vector<double> total, score;
-        for (const Run* run : runs)
-            total.push_back(final_value(*run, &Run::total)), score.push_back(final_value(*run, &Run::score));
-        scored = scored || spread_of(score).count > 0;
-        table.rows.push_back({runs[0]->about_method().label, seed_count(runs), plus_minus(spread_of(total)),
-                              plus_minus(spread_of(score))});
+    for (const Runs& runs : by_method)
+        for (const Run* run : runs) scored = scored || !std::isnan(final_value(*run, &Run::score));
+    part.section.tables.push_back(score_table(by_method));
+    if (any.mujoco_task) part.section.paragraphs.push_back(about_physics(any));
+    const std::string physics = any.mujoco_task ? " Runs with " + physics_of(any) + "." : "";
+
+    LineChart score = mean_chart(by_method, scored ? &Run::score : &Run::total);
+    score.title = any.task + (scored ? ": normalised score" : ": return");
+    score.cut_x = true;  // the last episode may overrun a round budget
+    score.y_label = scored ? "normalised score" : "return";
+    add_figure(part, name + "-curve", line_chart(score),
+               curve_caption(by_method) +
+                   (any.mujoco_task && scored ? " Score 0: a random policy; 100: an expert." : "") + physics);
+    if (!any.mujoco_task || ends_early(*any.mujoco_task)) {  // else a flat line
+        LineChart length = mean_chart(by_method, &Run::length);
+        length.title = any.task + ": evaluation length";
+        length.cut_x = true;
+        length.y_label = "evaluation length, steps";
+        add_figure(part, name + "-length", line_chart(length),
+                   who(by_method) + ". Lines and bands as in the figure before." + physics);
     }
-    part.section.tables.push_back(table);
-    LineChart chart = mean_chart(by_method, scored ? &Run::score : &Run::total);
-    chart.title = part.section.heading;
-    chart.y_label = scored ? "normalised score" : "return";
-    add_figure(part, name + "-curve", line_chart(chart), curve_caption(by_method));
+
+    for (const Runs& runs : by_method) {
+        const auto with_paths =
+            std::find_if(runs.begin(), runs.end(), [](const Run* run) { return !run->paths.empty(); });
+        if (with_paths != runs.end()) add_paths(part, **with_paths, name);
+    }
 }
 
 // A mean over seeds needs each seed once and nothing else different.
@@ -641,6 +805,15 @@ inline void check_seeds(const Runs& runs) {
     }
 }
 
+// In a section, since versions of the library may differ in every digit.
+inline void check_mujoco(const Runs& runs) {
+    for (const Run* run : runs)
+        if (run->mujoco_version != runs[0]->mujoco_version)
+            fail("report.mujoco", "%s was run on MuJoCo %s and %s on MuJoCo %s; report them apart",
+                 runs[0]->folder.c_str(), runs[0]->mujoco_version.c_str(), run->folder.c_str(),
+                 run->mujoco_version.c_str());
+}
+
 // The commands that made the runs, one for each unbroken range of seeds.
 inline Table repeat_table(const std::vector<Runs>& by_method) {
     Table table{{"To repeat these runs", "Arithmetic"}, {}};
@@ -650,18 +823,21 @@ inline Table repeat_table(const std::vector<Runs>& by_method) {
             const std::string one = setting_or(*run, "arithmetic", "not recorded");
             if (arithmetic.find(one) == std::string::npos) arithmetic += (arithmetic.empty() ? "" : ", ") + one;
         }
+        const std::string physics =
+            runs[0]->mujoco_task ? std::string(" --physics ") + physics_names[static_cast<size_t>(runs[0]->physics)]
+                                 : "";
         for (const auto& [first, last] : seed_ranges(runs)) {
             const std::string seeds = first < last ? " --seeds " + std::to_string(first) + "-" + std::to_string(last)
                                                    : " --seed " + std::to_string(first);
             table.rows.push_back({"wodtem train " + runs[0]->task + " --method " + method_names[runs[0]->method] +
-                                      " --preset " + runs[0]->preset + seeds + other_options(*runs[0]),
+                                      " --preset " + runs[0]->preset + seeds + physics + other_options(*runs[0]),
                                   arithmetic});
         }
     }
     return table;
 }
 
-// `runs`: of one task and preset, by method, then seed.
+// `runs`: of one task, preset and physics, by method, then seed.
 inline Part make_part(const Runs& runs) {
     std::vector<Runs> by_method;
     for (const Run* run : runs) {
@@ -669,10 +845,17 @@ inline Part make_part(const Runs& runs) {
         by_method.back().push_back(run);
     }
     for (const Runs& seeds : by_method) check_seeds(seeds);
+    check_mujoco(runs);
     const std::string &task = runs.at(0)->task, &preset = runs[0]->preset;
+    std::string name = task + "-" + preset;
     Part part;
     part.section.heading = task + ", preset " + preset;
-    (task == "gridworld" ? add_gridworld : add_other_task)(part, by_method, task + "-" + preset);
+    if (runs[0]->mujoco_task) {
+        const std::string physics = physics_names[static_cast<size_t>(runs[0]->physics)];
+        part.section.heading += ", physics " + physics;
+        if (runs[0]->physics != Physics::d4rl) name += "-physics-" + physics;
+    }
+    (task == "gridworld" ? add_gridworld : add_other_task)(part, by_method, name);
     part.section.tables.push_back(repeat_table(by_method));
     return part;
 }
@@ -694,6 +877,12 @@ inline const char* how_to_read =
     "the paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). A run that has not "
     "finished is marked so and counts with its latest evaluation. The last table has the commands that repeat the "
     "runs; the file settings in a run's folder has the value of every setting and where it came from.";
+inline const char* how_to_read_scores =
+    "Normalised score, as D4RL defines it: 0 for the return of a random policy, 100 for that of an expert, linear between "
+    "and beyond; each section gives both returns. Final: by the last evaluation of a run; mean of last 10: over its last "
+    "ten evaluations; an evaluation that came to nothing (nan in progress.csv) is passed over. Lengths are in steps. "
+    "Interactions: online, of each run, from the least to the most. Runs with different physics stand in sections of "
+    "their own and are never averaged.";
 
 }  // namespace results
 
@@ -706,9 +895,11 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     std::stable_sort(all.begin(), all.end(), [](const Run& a, const Run& b) {
         return std::tie(a.task, a.preset, a.method, a.seed) < std::tie(b.task, b.preset, b.method, b.seed);
     });
-    std::map<std::pair<std::string, std::string>, Runs> groups;
-    for (const Run& run : all) groups[{run.task, run.preset}].push_back(&run);
+    std::map<std::tuple<std::string, std::string, Physics>, Runs> groups;
+    for (const Run& run : all) groups[{run.task, run.preset, run.physics}].push_back(&run);
     std::vector<Part> parts = {{{"How to read this", {how_to_read}, {}, {}}, {}}};
+    if (std::any_of(all.begin(), all.end(), [](const Run& run) { return run.mujoco_task != nullptr; }))
+        parts[0].section.paragraphs.push_back(how_to_read_scores);
     for (const auto& group : groups) parts.push_back(make_part(group.second));
 
     std::error_code error;

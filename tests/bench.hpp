@@ -128,3 +128,124 @@ void bench_memory(size_t entries) {
         insertion / static_cast<double>(entries) * 1e6, build,
         static_cast<double>(memory.bytes()) / static_cast<double>(entries));
 }
+
+#ifdef WODTEM_MUJOCO
+
+// Episodes of random actions: through the environment, and as calls of the engine that the task cannot do without:
+// mj_step frame_skip times per action (for maze2d mj_forward before it, which D4RL's velocity clip asks for).
+void bench_environment(const MujocoTask& task) {
+    MujocoEnvironment environment(task, Physics::d4rl);
+    const mjModel* model = environment.model.get();
+    mjData* data = environment.data.get();
+    struct Recorded {
+        std::vector<double> qpos, qvel, controls;
+        Trajectory trajectory;
+    };
+    std::vector<Recorded> episodes;
+    size_t steps = 0;
+    for (uint64_t number = 0; steps < 1000; ++number) {
+        std::vector<float> state(static_cast<size_t>(task.state_dim));
+        environment.reset({0, Stream::environment}, data_set_episodes + number, state.data());
+        Recorded episode{{data->qpos, data->qpos + model->nq}, {data->qvel, data->qvel + model->nv}, {}, {}};
+        episode.trajectory = random_trajectory(environment, 0, number).value();
+        steps += episode.trajectory.rewards.size();
+        for (size_t i = 0; i < episode.trajectory.actions.size(); ++i) {  // what the actuators get, made beforehand
+            const double* range = &model->actuator_ctrlrange[2 * (i % static_cast<size_t>(model->nu))];
+            episode.controls.push_back(range[0] + (episode.trajectory.actions[i] + 1.0) * 0.5 * (range[1] - range[0]));
+        }
+        episodes.push_back(episode);
+    }
+    std::vector<float> state(static_cast<size_t>(task.state_dim));
+    const auto ours = [&] {
+        for (const Recorded& episode : episodes) {
+            environment.start(episode.qpos, episode.qvel);
+            for (size_t at = 0; at < episode.controls.size(); at += static_cast<size_t>(model->nu))
+                environment.step(&episode.trajectory.actions[at], state.data());
+        }
+    };
+    const auto bare = [&] {
+        for (const Recorded& episode : episodes) {
+            mj_resetData(model, data);
+            std::copy(episode.qpos.begin(), episode.qpos.end(), data->qpos);
+            std::copy(episode.qvel.begin(), episode.qvel.end(), data->qvel);
+            mj_forward(model, data);
+            for (size_t at = 0; at < episode.controls.size(); at += static_cast<size_t>(model->nu)) {
+                if (task.rules == Rules::maze2d) mj_forward(model, data);
+                std::copy_n(&episode.controls[at], model->nu, data->ctrl);
+                for (int i = 0; i < task.frame_skip; ++i) mj_step(model, data);
+            }
+        }
+    };
+    ours();
+    bare();
+    std::vector<double> rates, overheads;  // of neighbours in time: a machine's speed moves
+    for (int round = 0; round < 25; ++round) {
+        const double a = seconds_of(ours), b = seconds_of(bare);
+        rates.push_back(static_cast<double>(steps) / a);
+        overheads.push_back(100 * (a / b - 1));
+    }
+    std::sort(rates.begin(), rates.end());
+    std::sort(overheads.begin(), overheads.end());
+    std::printf("  %-22s %9.0f steps/s, %8.0f mj_step/s, overhead %5.1f%%  (quartiles %.1f%% to %.1f%%)\n", task.name,
+                rates[12], rates[12] * task.frame_skip, overheads[12], overheads[6], overheads[18]);
+}
+
+// Mean and standard error over episodes.
+std::pair<double, double> mean_and_error(const std::vector<double>& values) {
+    double sum = 0, squares = 0;
+    for (const double x : values) sum += x;
+    const double n = static_cast<double>(values.size()), mean = sum / n;
+    for (const double x : values) squares += (x - mean) * (x - mean);
+    return {mean, std::sqrt(squares / (n - 1) / n)};
+}
+
+struct RandomPolicy {
+    std::vector<double> lengths, returns;  // of each episode
+};
+
+// Uniformly random actions, spread over threads; the same episodes for any number of them.
+RandomPolicy play_randomly(const MujocoTask& task, Physics physics, int count, int threads) {
+    Threads workers(threads);
+    std::vector<MujocoEnvironment> environments(static_cast<size_t>(threads), MujocoEnvironment(task, physics));
+    const std::vector<double> none(static_cast<size_t>(count));
+    RandomPolicy result{none, none};
+    workers.run(count, [&](int episode, int worker) {
+        const size_t i = static_cast<size_t>(episode);
+        const auto trajectory = random_trajectory(environments[static_cast<size_t>(worker)], 0, i);
+        result.lengths[i] = trajectory ? static_cast<double>(trajectory->length()) : NAN;
+        result.returns[i] =
+            trajectory ? std::accumulate(trajectory->rewards.begin(), trajectory->rewards.end(), 0.0) : NAN;
+    });
+    return result;
+}
+
+// What is published of D4RL's -random-v2 sets, a million steps each: mean length (steps / episodes), mean return. For
+// mazes the reference score's minimum: the mean of 100 random episodes.
+struct PublishedRandom {
+    const char* task;
+    int episodes;  // that we play: their standard error resolves the two physics where the tasks do
+    double length, total;
+};
+constexpr PublishedRandom published_random[] = {
+    {"hopper", 120000, 1e6 / 45240, 18.399}, {"walker2d", 12000, 1e6 / 48908, 1.871},
+    {"halfcheetah", 400, 1000, -288.8},      {"ant", 1200, 1e6 / 5822, NAN},
+    {"maze2d-umaze", 1000, 300, 23.85},      {"maze2d-medium", 1000, 600, 13.13},
+    {"maze2d-large", 1000, 800, 6.7},        {"antmaze-umaze", 40, 700, 0},
+};
+
+void bench_random_policy(int threads) {
+    for (const PublishedRandom& row : published_random)
+        for (const Physics physics : {Physics::d4rl, Physics::mujoco_2_2}) {
+            const MujocoTask& task = *find_mujoco_task(row.task);
+            if (task.rules == Rules::maze2d && physics == Physics::mujoco_2_2) continue;  // a ball is a ball
+            const RandomPolicy result = play_randomly(task, physics, row.episodes, threads);
+            const auto [length, length_error] = mean_and_error(result.lengths);
+            const auto [total, total_error] = mean_and_error(result.returns);
+            std::printf("  %-14s %-4s %6d episodes  length %8.3f +- %.3f (published %.3f)  return %8.3f +- %.3f (%s)\n",
+                        task.name, physics_names[static_cast<size_t>(physics)], row.episodes, length, length_error,
+                        row.length, total, total_error,
+                        std::isnan(row.total) ? "not published" : ("published " + number_text(row.total)).c_str());
+        }
+}
+
+#endif

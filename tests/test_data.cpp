@@ -383,6 +383,15 @@ TEST(line_chart_breaks_at_missing_values) {
         CHECK_EQUAL(line_chart(chart), svg);
     }
     check_figure(line_chart({"nothing yet", "x", "y", {}, {}}));
+    chart.series = {{"a", Colour::blue, {0, 20700}, {9, 8}, {}}};
+    CHECK_EQUAL(count(line_chart(chart), ">25,000<"), size_t{1});
+    chart.cut_x = true;
+    CHECK_EQUAL(count(line_chart(chart), ">25,000<"), size_t{0});
+    CHECK_EQUAL(count(line_chart(chart), ">20,000<"), size_t{1});
+    for (const double x : {0.0, not_measured, 1e300}) {
+        chart.series[0].x = {x, x};
+        check_figure(line_chart(chart));
+    }
     chart.series[0].mean.pop_back();
     CHECK_FAILS("figure.length", line_chart(chart));
 }
@@ -411,6 +420,49 @@ TEST(grid_policy_draws_one_arrow_per_action) {
     CHECK_EQUAL(count(svg, "#B9DAEF"), size_t{3 + 1});
     policy.arrows.pop_back();
     CHECK_FAILS("figure.length", grid_policy(policy));
+}
+
+TEST(maze_paths_draws_the_map_as_printed_and_each_path_on_it) {
+    // Three rows and four columns: cells of 150, the first at (48, 76).
+    MazePaths maze{"m <1>", "1111/1001/1011/", 0.5, "goal & radius", {}};
+    maze.paths = {{{1, 2}, {{1, 1}, {1, 1.5}, {1, 2}}}, {{1, 2}, {{2, 1}, {1, 1}}}};
+    const std::string svg = maze_paths(maze);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "#C8C8C8"), size_t{9});  // walls
+    CHECK_EQUAL(count(svg, "<rect x=\"198\" y=\"376\""), size_t{0});
+    CHECK_EQUAL(count(svg, "<rect x=\"348\" y=\"376\""), size_t{1});               // row 2, column 2
+    CHECK_EQUAL(count(svg, "d=\"M 273 301 348 301 423 301 \""), size_t{1});        // a row goes from left to right
+    CHECK_EQUAL(count(svg, "d=\"M 273 451 273 301 \""), size_t{1});                // upwards from row 2 to row 1
+    CHECK_EQUAL(count(svg, "<circle cx=\"423\" cy=\"301\" r=\"75\""), size_t{1});  // one goal for both
+    CHECK_EQUAL(count(svg, "r=\"5\""), size_t{2 + 1});                             // starts, and the legend's
+    CHECK_EQUAL(count(svg, "stroke-width=\"3\""), size_t{2 * (2 + 1)});            // ends are crosses
+    CHECK_EQUAL(count(svg, "goal &amp; radius"), size_t{1});
+    CHECK_EQUAL(maze_paths(maze), svg);
+
+    maze.paths[1].goal = {1, 1};
+    maze.goal_radius = 0.125;
+    const std::string two_goals = maze_paths(maze);
+    CHECK_EQUAL(count(two_goals, "r=\"18.75\" fill=\"none\" stroke=\"#0072B2\""), size_t{1});
+    CHECK_EQUAL(count(two_goals, "r=\"18.75\" fill=\"none\" stroke=\"#D55E00\""), size_t{1});
+}
+
+TEST(maze_path_leaves_out_small_steps_and_what_is_no_number) {
+    MazePaths maze{"m", "111/101/111/", 0.5, "", {}};  // cells of 160
+    std::vector<Place>& places = maze.paths.emplace_back().places;
+    for (int i = 0; i <= 1000; ++i) places.push_back({1, 0.5 + 0.001 * i});  // one cell long
+    std::string svg = maze_paths(maze);
+    check_figure(svg);
+    const size_t from = svg.find("d=\"M "), length = svg.find('"', from + 3) - from;
+    CHECK(count(svg.substr(from, length), " 316 ") >= 48 && count(svg.substr(from, length), " 316 ") <= 52);
+    CHECK(svg.substr(from, length).ends_with(" 368 316 "));  // the last place, however near
+
+    maze.paths[0] = {{not_measured, 1}, {{1, not_measured}, {1, 1}, {1, 2}, {1e300, 1}, {2, 2}, {1, 2}, {-1e20, 9}}};
+    svg = maze_paths(maze);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "d=\"M 288 316 448 316 M 448 476 448 316 528 76 \""), size_t{1});  // far off: on the edge
+    CHECK_EQUAL(count(svg, "<circle"), size_t{2});  // of the legend: neither goal nor start is a place
+    for (const char* map : {"", "/", "///", "1", "1/11111/x"})
+        check_figure(maze_paths({"", map, not_measured, "", {{{0, 0}, {}}, {{0, 1}, {{0, 0}}}}}));
 }
 
 TEST(page_is_one_well_formed_file) {

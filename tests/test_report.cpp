@@ -63,6 +63,31 @@ std::string write_run(const std::string& parent, const std::string& method, int 
     return folder;
 }
 
+struct Evaluated {
+    int interactions;
+    double length, total, score;
+};
+
+// A finished run of a MuJoCo task with preset paper.
+std::string write_mujoco_run(const std::string& parent, const std::string& task, const std::string& method, int seed,
+                             const std::vector<Evaluated>& evaluations,
+                             const std::string& physics = "physics = d4rl # chosen\nmujoco = 2.2.2 # a\n") {
+    const std::string folder = parent + "/" + task + "-" + method + "-" + std::to_string(seed);
+    write(folder, "settings",
+          "task = " + task + " # command line\nmethod = " + method +
+              " # command line\npreset = paper # command line\nseed = " + std::to_string(seed) + " # command line\n" +
+              physics);
+    std::string progress = "interactions,eval_length,eval_return,eval_score,physics\n";
+    for (const Evaluated& e : evaluations)
+        progress += std::to_string(e.interactions) + "," + std::to_string(e.length) + "," + std::to_string(e.total) +
+                    "," + std::to_string(e.score) + ",d4rl on MuJoCo 2.2.2\n";
+    write(folder, "progress.csv", progress);
+    if (method != "dt")
+        write(folder, "episodes.csv", "interactions,length,return,physics\n100,100,20,d4rl on MuJoCo 2.2.2\n");
+    write(folder, "finished", "");
+    return folder;
+}
+
 Run run_with(const std::vector<double>& interactions, const std::vector<double>& length, bool finished) {
     Run run;
     run.interactions = interactions, run.length = length, run.finished = finished;
@@ -76,6 +101,15 @@ bool equal(const std::vector<double>& got, const std::vector<double>& expected) 
         same = got[i] == expected[i] || (std::isnan(got[i]) && std::isnan(expected[i]));
     return same;
 }
+
+size_t count(const std::string& text, const std::string& part) {
+    size_t found = 0;
+    for (size_t at = text.find(part); at != std::string::npos; at = text.find(part, at + 1)) ++found;
+    return found;
+}
+
+#define CHECK_CONTAINS(text, part) \
+    if (count(text, part) == 0) CHECK_EQUAL(std::string(part), "is not in " + (text))
 
 }  // namespace
 
@@ -222,19 +256,154 @@ TEST(report_of_a_run_that_has_just_begun_has_dashes) {
     CHECK(markdown.find("| ODT seed 3 | unfinished, at 0 | - | - | - | - |") != std::string::npos);
 }
 
-TEST(report_of_another_task_has_one_curve) {
+TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
     const TemporaryFolder temporary;
-    const std::string folder = temporary.path + "/run";
-    write(folder, "settings", "task = hopper-medium-v2 # a\nmethod = odt # a\npreset = paper # a\nseed = 0 # a\n");
-    write(folder, "progress.csv",
-          "interactions,eval_length,eval_return,eval_score\n0,900,2000,62.5\n5000,1000,3200,nan\n");
-    write(folder, "episodes.csv", "interactions,length,return\n1000,1000,2000\n");
-    write(folder, "finished", "");
-    report({folder}, temporary.path + "/out");
-    CHECK(read_file(temporary.path + "/out/report.md").find("| ODT | 1 | 3,200.00 ± - | 62.50 ± - |") !=
-          std::string::npos);
-    CHECK(read_file(temporary.path + "/out/hopper-medium-v2-paper-curve.svg").find("normalised score") !=
-          std::string::npos);
+    const std::string out = temporary.path + "/out";
+    report({write_mujoco_run(temporary.path, "hopper-medium-v2", "odt", 0,
+                             {{0, 900, 2000, 61}, {4000, 1000, 3000, 70}, {5000, 1000, 3200, none}}),
+            write_mujoco_run(temporary.path, "hopper-medium-v2", "odt", 1, {{0, 800, 1000, 40}, {5100, 700, 0, 50}}),
+            write_mujoco_run(temporary.path, "hopper-medium-v2", "dt", 0, {{0, 500, 1500, 47}})},
+           out);
+    const std::string page = read_file(out + "/report.md");
+    for (
+        const char* part :
+        {"hopper-medium-v2, preset paper, physics d4rl\n",
+         "All runs: physics d4rl on MuJoCo 2.2.2, masses and inertias as "
+         "in MuJoCo up to 2.1.0, which made D4RL's data. Score 0 is a mean return of −20.27, score 100 one of 3,234.30.",
+         "Normalised score, as D4RL defines it", "| DT | 1 | 47.00 ± - | 47.00 ± - | 1,500.00 ± - | 500.00 ± - | 0 |",
+         // scores 70 and 50 (nan is passed over), means (61 + 70) / 2 and (40 + 50) / 2
+         "| ODT | 2 | 60.00 ± 14.14 | 55.25 ± 14.50 | 1,600.00 ± 2,262.74 | 850.00 ± 212.13 | 5,000–5,100 |",
+         "--method odt --preset paper --seeds 0-1 --physics d4rl |"})
+        CHECK_CONTAINS(page, part);
+    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-curve.svg"), ">normalised score<");
+    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-length.svg"), ">evaluation length, steps<");
+}
+
+TEST(report_falls_back_to_returns_where_there_is_no_score) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out";
+    report({write_mujoco_run(temporary.path, "ant-v2", "odt", 0, {{0, 900, 2000, none}})}, out);
+    CHECK_CONTAINS(read_file(out + "/report.md"), "| ODT | 1 | - | - | 2,000.00 ± - | 900.00 ± - | 100 |");
+    CHECK_CONTAINS(read_file(out + "/ant-v2-paper-curve.svg"), ">return<");
+
+    report({write_mujoco_run(temporary.path, "elsewhere", "odt", 0, {{0, 900, 2000, 3}, {200, 800, 1000, 4}}, "")},
+           out);
+    const std::string page = read_file(out + "/report.md");  // a task that this version does not know
+    CHECK_CONTAINS(page, "elsewhere, preset paper\n");
+    CHECK_CONTAINS(page, "| ODT | 1 | 4.00 ± - | 3.50 ± - | 1,000.00 ± - | 800.00 ± - | 200 |");
+    CHECK_CONTAINS(page, "![](elsewhere-paper-length.svg)");
+    CHECK(page.find("physics") == std::string::npos && page.find("D4RL") == std::string::npos);
+}
+
+TEST(physics_are_never_mixed) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out";
+    const auto run = [&](int seed, const std::string& physics, const std::string& source, const std::string& version) {
+        const std::string parent = temporary.path + "/" + physics + source + version;
+        return write_mujoco_run(parent, "walker2d-v2", "odt", seed, {{0, 900, 2000, 10.0 * seed}},
+                                "physics = " + physics + " # " + source + "\nmujoco = " + version + " # a\n");
+    };
+    const std::string a = run(1, "d4rl", "chosen", "2.2.2"), b = run(3, "d4rl", "command line", "2.2.2"),
+                      c = run(5, "2.2", "command line", "2.2.2");
+    report({a, b, c}, out);  // asked for or not, the same physics are the same
+    const std::string page = read_file(out + "/report.md");
+    CHECK_CONTAINS(page, "walker2d-v2, preset paper, physics d4rl\n");
+    CHECK_CONTAINS(page, "| ODT | 2 | 20.00 ± 14.14 |");
+    CHECK_CONTAINS(page, "walker2d-v2, preset paper, physics 2.2\n");
+    CHECK_CONTAINS(page, "| ODT | 1 | 50.00 ± - |");
+    CHECK_CONTAINS(page,
+                   "physics 2.2 on MuJoCo 2.2.2, masses and inertias as MuJoCo 2.2 computes them from the geometry");
+    CHECK_CONTAINS(page, "--seed 5 --physics 2.2 |");
+    CHECK_CONTAINS(page, "![](walker2d-v2-paper-curve.svg)");
+    CHECK_CONTAINS(page, "![](walker2d-v2-paper-physics-2.2-curve.svg)");
+    CHECK_FAILS("report.mujoco", report({a, run(7, "d4rl", "chosen", "2.2.1")}, out));
+    CHECK_FAILS("report.setting", report({run(1, "none", "a", "2.2.2")}, out));
+    CHECK_FAILS("report.setting", report({run(1, "d4rl", "a", "2/2")}, out));
+}
+
+TEST(report_draws_the_paths_through_a_maze) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", header = "episode,step,goal_x,goal_y,x,y\n";
+    const auto ball = [&](const char* method, int seed) {
+        return write_mujoco_run(temporary.path, "maze2d-umaze-v1", method, seed,
+                                {{0, 300, 30, 4.5}, {20050, 300, 60, 26.2}});
+    };
+    const std::string first = ball("odt", 0), second = ball("odt", 1), dt = ball("dt", 0);
+    report({first, second, dt}, out);  // no paths.csv anywhere
+    CHECK(read_file(out + "/report.md").find("paths") == std::string::npos);
+
+    // Observed (2, 0.8) lies at row 2.2, column 1 of the map, cells of 96, the first at (48, 76).
+    write(second, "paths.csv",
+          header + "0,0,1,1,2,0.8\n0,1,1,1,1.5,0.8\n1,0,1,1,2.8,2.8\n1,1,1,1,2.8,1.8\n2,0,1,1,1.4,0.7\n2,1,1,1,3,1\n");
+    write(first, "paths.csv", header);
+    std::filesystem::remove(second + "/finished");
+    report({dt, second, first}, out);
+    const std::string maze = read_file(out + "/maze2d-umaze-v1-paper-paths-odt.svg");
+    const std::string page = read_file(out + "/report.md");
+    CHECK_CONTAINS(maze, "maze2d-umaze-v1: paths of ODT seed 1");
+    CHECK_CONTAINS(maze, "d=\"M 192 335.2 192 287.2 \"");
+    CHECK_CONTAINS(maze, "<circle cx=\"211.2\" cy=\"239.2\" r=\"48\"");  // observed (1, 1) is (1.2, 1.2)
+    CHECK_CONTAINS(maze, "goal (radius 0.5 m)");
+    CHECK_EQUAL(count(maze, "#C8C8C8"), size_t{18});  // 25 cells, 7 free
+    CHECK_CONTAINS(page, "![](maze2d-umaze-v1-paper-paths-odt.svg)");
+    CHECK_CONTAINS(
+        page,
+        "ODT seed 1, unfinished: its latest evaluation, at 20,050 online interactions, physics d4rl on MuJoCo "
+        "2.2.2. 1 of 3 episodes came within 0.5 m of the goal at some time. None ends there: the score counts");
+    CHECK(page.find("paths-dt") == std::string::npos);
+    CHECK(page.find("-length.svg") == std::string::npos);  // every episode takes 300 steps
+    CHECK_CONTAINS(page, "Every episode takes 300 steps.");
+
+    // Observed (8, 1) of an ant lies at row 1.25, column 3. Twelve episodes: ten are drawn.
+    const std::string ant =
+        write_mujoco_run(temporary.path, "antmaze-umaze-v2", "wodtem", 0, {{0, 700, 0.5, 50}, {900, 700, 0.5, 50}});
+    std::string paths = header;
+    for (int i = 0; i < 12; ++i)
+        for (const char* step : {",0,", ",1,"})
+            paths += std::to_string(i) + step + "0.8,8." + std::to_string(i) + (step[1] == '0' ? ",8,1\n" : ",1,8.4\n");
+    write(ant, "paths.csv", paths);  // the tenth ends 0.54 m from its goal
+    report({ant}, out);
+    const std::string ant_maze = read_file(out + "/antmaze-umaze-v2-paper-paths-wodtem.svg");
+    CHECK_EQUAL(count(ant_maze, "d=\"M 384 244 216 421.6 \""), size_t{10});
+    CHECK_CONTAINS(ant_maze, "<circle cx=\"211.2\" cy=\"421.6\" r=\"12\"");  // (0.8, 8.4): row 3.1, column 1.2
+    CHECK_EQUAL(count(ant_maze, "r=\"12\""), size_t{10});
+    CHECK_CONTAINS(
+        read_file(out + "/report.md"),
+        "11 of 12 episodes came within 0.5 m of the goal, which ended them; each has a goal of its own, circled "
+        "in its colour. The first 10 are drawn.");
+}
+
+TEST(paths_that_cannot_be_are_refused_with_their_line) {
+    const TemporaryFolder temporary;
+    const std::string run = write_mujoco_run(temporary.path, "maze2d-large-v1", "odt", 0, {{0, 800, 30, 4.5}});
+    const std::string head = "episode,step,goal_x,goal_y,x,y\n0,0,7,9,1,1\n0,1,7,9,1,1\n", file = run + "/paths.csv";
+    const auto fails = [&](const char* id, const std::string& text, const std::string& place) {
+        write(run, "paths.csv", text);
+        try {
+            report({run}, temporary.path + "/out");
+            CHECK_EQUAL(text, "was not refused");
+        } catch (const Error& error) {
+            CHECK_EQUAL(error.id, id);
+            CHECK_CONTAINS(std::string(error.what()), file + ": " + place);
+        }
+    };
+    fails("csv.unfinished", "", "line 1 ");
+    fails("csv.unfinished", head + "0,2,7,9,1", "line 4 ");
+    fails("csv.column", "episode,step,goal_x,goal_y,x\n", "line 1 ");
+    fails("csv.fields", head + "0,2,7,9,1\n", "line 4 ");
+    fails("csv.number", head + "0,2,7,9,1,y\n", "line 4: ");
+    for (const char* row : {"0,3,7,9,1,1", "0,1,7,9,1,1", "1,2,7,9,1,1", "0,0,7,9,1,1", "2,0,7,9,1,1", "0,1.5,7,9,1,1",
+                            "nan,2,7,9,1,1", "-1,0,7,9,1,1"})
+        fails("report.order", head + row + "\n", "line 4: ");
+    fails("report.order", "episode,step,goal_x,goal_y,x,y\n0,1,7,9,1,1\n", "line 2: ");
+    for (const char* row : {"0,nan,7,9,1,1", "0,801,7,9,1,1", "0,2,7,9,nan,1", "0,2,7,9,1,inf", "0,2,7,9,-10,1",
+                            "0,2,7,9,1,24", "0,2,7,nan,1,1", "0,2,1e300,9,1,1"})
+        fails("report.range", head + row + "\n", "line 4: ");
+    fails("report.goal", head + "0,2,7,9.5,1,1\n", "line 4: ");
+
+    const std::string hopper = write_mujoco_run(temporary.path, "hopper-v2", "odt", 0, {{0, 800, 30, 4.5}});
+    write(hopper, "paths.csv", "not of a maze");  // and so not looked at
+    report({hopper}, temporary.path + "/out");
 }
 
 TEST(report_names_each_way_a_folder_can_be_wrong) {
