@@ -240,17 +240,15 @@ inline std::string task_model(const MujocoTask& task, Physics physics) {
     return xml + "</mujoco>";
 }
 
-// What the engine said last on this thread. By itself it would print, or wait for a key.
-inline thread_local std::string engine_message;
-
-inline void listen_to_engine() {
+// By itself the engine would wait for a key at an error, and print and log warnings, whose counters we read.
+inline void silence_engine() {
     mju_user_error = [](const char* text) { fail("mujoco.engine", "MuJoCo: %s", text); };
-    mju_user_warning = [](const char* text) { engine_message = text; };
+    mju_user_warning = [](const char*) {};
 }
 
-// Errors: mujoco.model.
+// Errors: mujoco.version, mujoco.model.
 inline std::shared_ptr<const mjModel> load_model(const MujocoTask& task, Physics physics) {
-    listen_to_engine();
+    silence_engine();
     if (mj_version() != mjVERSION_HEADER)
         fail("mujoco.version", "this program was built with MuJoCo %d and finds the library of %d; build it again",
              mjVERSION_HEADER, mj_version());
@@ -384,10 +382,10 @@ struct MujocoEnvironment {
         const double *qpos = data->qpos, *qvel = data->qvel;
         switch (task->rules) {
             case Rules::hopper: {  // gym's Hopper-v2; velocities are not clipped here
-                bool bounded = true;
+                bool bounded = all_finite();
                 for (int i = 2; i < model->nq; ++i) bounded = bounded && std::fabs(qpos[i]) < 100;
                 for (int i = 0; i < model->nv; ++i) bounded = bounded && std::fabs(qvel[i]) < 100;
-                return !(bounded && std::isfinite(qpos[0]) && qpos[1] > 0.7 && std::fabs(qpos[2]) < 0.2);
+                return !(bounded && qpos[1] > 0.7 && std::fabs(qpos[2]) < 0.2);
             }
             case Rules::walker2d:  // gym's Walker2d-v2: height, pitch
                 return !(qpos[1] > 0.8 && qpos[1] < 2.0 && qpos[2] > -1.0 && qpos[2] < 1.0);
