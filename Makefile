@@ -13,7 +13,8 @@
 CXX = g++
 # -O3: loops in vectors. -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
-CXXFLAGS = -std=c++20 -O3 -pthread -ffp-contract=off \
+# -fno-math-errno: a square root is an instruction.
+CXXFLAGS = -std=c++20 -O3 -pthread -ffp-contract=off -fno-math-errno \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
 HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml tests/*.hpp)
 # Asked when it is needed, after `packages`.

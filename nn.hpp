@@ -65,6 +65,36 @@ inline Words4 philox(Words4 counter, uint32_t key0, uint32_t key1) {
     return counter;
 }
 
+// For the loops that cost most: compiled once for each instruction set, and chosen when the program starts. Every
+// operation is rounded by itself (-ffp-contract=off), so the bits are the same. (The sanitizers cannot start with it.)
+#if defined(__x86_64__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+#define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define EACH_TARGET
+#endif
+
+// words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16, eight at a time.
+EACH_TARGET inline void philox_16(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+    typedef uint64_t Lanes __attribute__((vector_size(64)));  // 32-bit numbers, with room for their products
+    const Lanes low = Lanes{} + 0xFFFFFFFF, number = {0, 1, 2, 3, 4, 5, 6, 7};
+    for (uint32_t first = 0; first < 16; first += 8) {
+        Lanes c[4] = {(number + (counter[0] + first)) & low, Lanes{} + counter[1], Lanes{} + counter[2],
+                      Lanes{} + counter[3]};
+        uint32_t k0 = key0, k1 = key1;
+        for (int round = 0; round < 10; ++round) {
+            const Lanes product0 = c[0] * 0xD2511F53, product1 = c[2] * 0xCD9E8D57;
+            c[0] = (product1 >> 32) ^ c[1] ^ k0;
+            c[1] = product1 & low;
+            c[2] = (product0 >> 32) ^ c[3] ^ k1;
+            c[3] = product0 & low;
+            k0 += 0x9E3779B9;
+            k1 += 0xBB67AE85;
+        }
+        for (size_t i = 0; i < 8; ++i)
+            for (size_t j = 0; j < 4; ++j) words[4 * (first + i) + j] = static_cast<uint32_t>(c[j][i]);
+    }
+}
+
 // Each use of chance has its own stream: switching one feature on or off moves no other's numbers. The values are part
 // of the format of a run (a porter needs them); never renumber.
 enum class Stream : uint32_t {
@@ -88,6 +118,12 @@ struct Random {
     Words4 words(uint64_t step, uint32_t index, uint32_t site = 0) const {
         return philox({index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed,
                       static_cast<uint32_t>(stream));
+    }
+
+    // The words of `index` to `index` + 15, one after the other.
+    void words_16(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
+        philox_16(words, {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed,
+                  static_cast<uint32_t>(stream));
     }
 
     // Uniform in [0, 1), a multiple of 2^-53.
@@ -522,7 +558,7 @@ inline void matmul(Compute&, View<double> c, View<const double> a, View<const do
 
 // Sum of a[i] * b[i] in 16 lanes, folded in a fixed tree; faster than one chain of additions, and as reproducible.
 template <class T>
-T dot(const T* a, const T* b, int n) {
+ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
     typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
     typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
     Lanes sum = {};
@@ -594,7 +630,8 @@ template <class T>
 struct Tape {
     Compute& compute;
     bool recording = true;  // false: acting; no gradients, no dropout
-    size_t block = 0;       // which part of a batch this tape works on: parameters keep a gradient for each
+    size_t part = 0;        // which part of a batch this tape works on: each has its own dropout masks
+    size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: a fresh mask for each
 
@@ -795,7 +832,8 @@ struct Dropout {
     uint32_t site;
     float probability;
 
-    // f(first, last, factor) for the elements [begin, end) in chunks [first, last); element i has factor[i - first].
+    // f(first, last, factor) for the elements [begin, end) in chunks [first, last); element i has factor[i - first],
+    // which f may write over.
     template <class T, class F>
     void each_chunk(size_t begin, size_t end, F&& f) const {
         T factor[256];
@@ -811,17 +849,19 @@ struct Dropout {
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
         if (probability == 0) std::fill_n(factor, last - first, T(1));
-        for (size_t i = first; probability != 0 && i < last;) {
-            const Words4 words = random.words(step, static_cast<uint32_t>(i / 4), site);
-            for (const size_t block_end = std::min(last, (i / 4 + 1) * 4); i < block_end; ++i)
-                factor[i - first] = words[i % 4] < threshold ? T(0) : keep;
+        for (size_t i = first; probability != 0 && i < last;) {  // element i has word i % 4 of counter i / 4
+            uint32_t words[64];
+            random.words_16(words, step, static_cast<uint32_t>(i / 4), site);
+            const size_t skipped = i % 4, count = std::min(last - i, 64 - skipped);
+            for (size_t j = 0; j < count; ++j) factor[i - first + j] = words[skipped + j] < threshold ? T(0) : keep;
+            i += count;
         }
     }
 };
 
 template <class T>
 Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
-    const uint32_t own_site = site + static_cast<uint32_t>(tape.block << 20);  // each part of a batch has its own masks
+    const uint32_t own_site = site + static_cast<uint32_t>(tape.part << 20);
     return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
@@ -890,6 +930,25 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
+// What attention does with n rows [size] that lie `stride` apart: y_j = scale (x . row_j);  to += sum_j weight_j row_j;
+// row_j += weight_j x.
+#define ATTENTION_ROWS(TARGET, T)                                                                                     \
+    TARGET inline void dot_rows(T* y, const T* x, const T* rows, ptrdiff_t stride, int n, int size, T scale) {        \
+        for (int j = 0; j < n; ++j) y[j] = dot(x, rows + j * stride, size) * scale;                                   \
+    }                                                                                                                 \
+    TARGET inline void add_rows(T* __restrict to, const T* weight, const T* __restrict rows, ptrdiff_t stride, int n, \
+                                int size) {                                                                           \
+        for (int j = 0; j < n; ++j)                                                                                   \
+            for (int c = 0; c < size; ++c) to[c] += weight[j] * rows[j * stride + c];                                 \
+    }                                                                                                                 \
+    TARGET inline void add_to_rows(T* __restrict rows, const T* weight, const T* __restrict x, ptrdiff_t stride,      \
+                                   int n, int size) {                                                                 \
+        for (int j = 0; j < n; ++j)                                                                                   \
+            for (int c = 0; c < size; ++c) rows[j * stride + c] += weight[j] * x[c];                                  \
+    }
+ATTENTION_ROWS(EACH_TARGET, float)
+ATTENTION_ROWS(, double)
+
 template <class T>
 void softmax(T* x, int n) {
     T largest = x[0], total = 0;
@@ -905,6 +964,7 @@ template <class T>
 Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans, int span_count, const int* position,
                     int heads, Dropout dropout) {
     const int d = q.columns, size = d / heads;
+    const ptrdiff_t stride = 2 * d;  // from a key to the next
     const T scale = T(1) / std::sqrt(T(size));
     const Tensor<T> out = tape.make(q.rows, d);
     int longest = 1;
@@ -921,18 +981,16 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
                     const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
                     T *w = weights + first_weight, *o = out.value + static_cast<ptrdiff_t>(i) * d + h * size;
                     const T* query = q.value + static_cast<ptrdiff_t>(i) * d + h * size;
-                    const T *key = kv.value + static_cast<ptrdiff_t>(spans[s].first_token) * 2 * d + h * size,
-                            *v = key + d;
-                    for (int j = 0; j < seen; ++j)
-                        w[j] = dot(query, key + static_cast<ptrdiff_t>(j) * 2 * d, size) * scale;
+                    const T *key = kv.value + spans[s].first_token * stride + h * size, *v = key + d;
+                    dot_rows(w, query, key, stride, seen, size, scale);
                     softmax(w, seen);
                     std::fill_n(o, size, T(0));
                     dropout.each_chunk<T>(first_weight, first_weight + static_cast<size_t>(seen),
-                                          [=](size_t first, size_t last, const T* factor) {
-                                              for (size_t j = first - first_weight; j < last - first_weight; ++j)
-                                                  for (int c = 0; c < size; ++c)
-                                                      o[c] += factor[first_weight + j - first] * w[j] *
-                                                              v[static_cast<ptrdiff_t>(j) * 2 * d + c];
+                                          [=](size_t first, size_t last, T* factor) {
+                                              const ptrdiff_t j = static_cast<ptrdiff_t>(first - first_weight);
+                                              const int count = static_cast<int>(last - first);
+                                              for (ptrdiff_t k = 0; k < count; ++k) factor[k] *= w[j + k];
+                                              add_rows(o, factor, v + j * stride, stride, count, size);
                                           });
                 }
     });
@@ -945,31 +1003,25 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
                         const int seen = position[i] - spans[s].first_token + 1;
                         const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
                         const ptrdiff_t at = static_cast<ptrdiff_t>(i) * d + h * size;
-                        const ptrdiff_t first_key = static_cast<ptrdiff_t>(spans[s].first_token) * 2 * d + h * size;
+                        const ptrdiff_t first_key = spans[s].first_token * stride + h * size;
                         const T *w = weights + first_weight, *query = q.value + at, *d_out = out.gradient + at;
                         T *dw = d_weights + first_weight, *d_query = q.gradient + at;
                         // d_v_j += factor_j w_j d_out;  dw_j = factor_j v_j . d_out
-                        dropout.each_chunk<T>(
-                            first_weight, first_weight + static_cast<size_t>(seen),
-                            [=](size_t first, size_t last, const T* factors) {
-                                for (size_t element = first; element < last; ++element) {
-                                    const ptrdiff_t j = static_cast<ptrdiff_t>(element - first_weight),
-                                                    value = first_key + j * 2 * d + d;
-                                    const T factor = factors[element - first];
-                                    dw[j] = factor * dot(kv.value + value, d_out, size);
-                                    for (int c = 0; c < size; ++c) kv.gradient[value + c] += factor * w[j] * d_out[c];
-                                }
-                            });
+                        dropout.each_chunk<T>(first_weight, first_weight + static_cast<size_t>(seen),
+                                              [=](size_t first, size_t last, T* factor) {
+                                                  const ptrdiff_t j = static_cast<ptrdiff_t>(first - first_weight),
+                                                                  value = first_key + j * stride + d;
+                                                  const int count = static_cast<int>(last - first);
+                                                  dot_rows(dw + j, d_out, kv.value + value, stride, count, size, T(1));
+                                                  for (ptrdiff_t k = 0; k < count; ++k)
+                                                      dw[j + k] *= factor[k], factor[k] *= w[j + k];
+                                                  add_to_rows(kv.gradient + value, factor, d_out, stride, count, size);
+                                              });
                         // Through the softmax: d_score_j = w_j (dw_j - sum_m w_m dw_m).
                         const T mean = dot(w, dw, seen);
-                        for (int j = 0; j < seen; ++j) {
-                            const T d_score = w[j] * (dw[j] - mean) * scale;
-                            const ptrdiff_t key = first_key + static_cast<ptrdiff_t>(j) * 2 * d;
-                            for (int c = 0; c < size; ++c) {
-                                d_query[c] += d_score * kv.value[key + c];
-                                kv.gradient[key + c] += d_score * query[c];
-                            }
-                        }
+                        for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
+                        add_rows(d_query, dw, kv.value + first_key, stride, seen, size);
+                        add_to_rows(kv.gradient + first_key, dw, query, stride, seen, size);
                     }
         });
     });
@@ -1518,12 +1570,13 @@ inline double power(double x, uint64_t n) {
     return result;
 }
 
-// A tensor's share of the update, plain: m, v and the step u (before the learning rate), from the clipped gradient.
+// A tensor's share of the update: m, v and the step u (before the learning rate), from the clipped gradient.
 //   m = beta1 m + (1 - beta1) g;  v = beta2 v + (1 - beta2) g^2
 //   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon)
 // Written over the gradient, which is not needed any more.
-inline void adam_step(float* gradient, float* m, float* v, const float* value, size_t n, const OptimizerConfig& config,
-                      double scale, double bias1, double bias2) {
+EACH_TARGET inline void adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v,
+                                  const float* __restrict value, size_t n, const OptimizerConfig& config, double scale,
+                                  double bias1, double bias2) {
     const float beta1 = static_cast<float>(config.beta1), beta2 = static_cast<float>(config.beta2);
     const float one_minus_1 = static_cast<float>(1 - config.beta1), one_minus_2 = static_cast<float>(1 - config.beta2);
     const float clip = static_cast<float>(scale), root_bias2 = static_cast<float>(std::sqrt(bias2));
@@ -1535,6 +1588,18 @@ inline void adam_step(float* gradient, float* m, float* v, const float* value, s
         v[i] = beta2 * v[i] + one_minus_2 * g * g;
         gradient[i] = m[i] * inverse_bias1 / (std::sqrt(v[i]) / root_bias2 + epsilon) + decay * value[i];
     }
+}
+
+// value = shrink value - rate u, u in `gradient`, which is emptied. Returns whether all values are finite.
+EACH_TARGET inline bool apply_step(float* __restrict value, float* __restrict gradient, size_t n, float shrink,
+                                   float rate) {
+    int bad = 0;
+    for (size_t i = 0; i < n; ++i) {
+        value[i] = shrink * value[i] - rate * gradient[i];
+        gradient[i] = 0;
+        bad |= !(value[i] - value[i] == 0);  // infinity and NaN are not themselves less themselves
+    }
+    return !bad;
 }
 
 // Adds the gradients of all blocks, in order, to the first, and empties the others.
@@ -1604,13 +1669,9 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         std::vector<unsigned char> bad(static_cast<size_t>(blocks));
         for_rows(compute, blocks, 4 * block, [&](int begin, int end) {
             for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b) {
-                float zero = 0;  // 0 * x is 0 unless x is infinite or NaN
-                for (size_t i = b * block; i < std::min(n, (b + 1) * block); ++i) {
-                    parameter.value[i] = shrink * parameter.value[i] - rate * parameter.gradient[i];
-                    zero += 0 * parameter.value[i];
-                    parameter.gradient[i] = 0;
-                }
-                bad[b] = !(zero == 0);
+                const size_t first = b * block;
+                bad[b] = !apply_step(parameter.value.data() + first, parameter.gradient.data() + first,
+                                     std::min(n - first, block), shrink, rate);
             }
         });
         for (const unsigned char block_bad : bad)

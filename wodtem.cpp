@@ -573,11 +573,21 @@ struct Progress {
     }
 };
 
-// A batch is worked on in parts of fixed size, each on a tape of its own, where the network is so small that keeping a
-// gradient for each costs less than sharing out every operation. By shape alone: results must not depend on threads.
-size_t parts_of_batch(const Settings& settings) {
-    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
-    return weights < 100000 ? static_cast<size_t>(std::min<int64_t>(8, settings.batch_size)) : 1;
+// A batch is worked on in parts: results must not depend on threads, so by shape alone. Where the network is so small
+// that keeping a gradient for each part costs less than sharing out every operation, parts run side by side, each on a
+// tape of its own. Else they run one after the other on one tape, of about 2048 tokens each: what they compute is still
+// in the cache when it is wanted next, and activations take a fraction of the memory.
+struct Parts {
+    size_t count;
+    bool side_by_side;
+    size_t tapes() const { return side_by_side ? count : 1; }
+};
+
+Parts parts_of_batch(const Settings& settings) {
+    if (12 * settings.layers * settings.width * settings.width < 100000)
+        return {static_cast<size_t>(std::min<int64_t>(8, settings.batch_size)), true};
+    const int64_t windows = std::max<int64_t>(1, 2048 / (3 * settings.context_length));
+    return {static_cast<size_t>((settings.batch_size + windows - 1) / windows), false};
 }
 
 struct Run {
@@ -591,25 +601,26 @@ struct Run {
 
     // What it is worked with.
     Compute& compute;
-    std::vector<std::unique_ptr<Compute>> serial;     // one per part of a batch, if there are several
-    std::vector<std::unique_ptr<Tape<float>>> tapes;  // one per part of a batch
+    Parts parts;
+    std::vector<std::unique_ptr<Compute>> serial;     // one per tape, if there are several
+    std::vector<std::unique_ptr<Tape<float>>> tapes;  // one per part of a batch side by side, else one
     Tape<float> acting;
 
     Run(Compute& c, const Settings& settings, const EnvironmentSpec& spec)
         : agent{settings,
                 spec,
                 Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed),
-                                   parts_of_batch(settings)),
+                                   parts_of_batch(settings).tapes()),
                 {}},
           temperature(settings.initial_lambda),
           replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
           memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)),
           compute(c),
+          parts(parts_of_batch(settings)),
           acting(c) {
-        const size_t parts = parts_of_batch(settings);
-        for (size_t part = 0; part < parts; ++part) {
-            if (parts > 1) serial.push_back(std::make_unique<Compute>(c.kernel, 1));
-            tapes.push_back(std::make_unique<Tape<float>>(parts > 1 ? *serial.back() : c));
+        for (size_t tape = 0; tape < parts.tapes(); ++tape) {
+            if (parts.tapes() > 1) serial.push_back(std::make_unique<Compute>(c.kernel, 1));
+            tapes.push_back(std::make_unique<Tape<float>>(parts.tapes() > 1 ? *serial.back() : c));
         }
         acting.recording = false;  // and so no dropout
     }
@@ -814,7 +825,7 @@ void update_lambda(Run& run, double entropy) {
     update_parameters(run.compute, run.temperature.log_lambda, run.temperature.optimizer, config);
 }
 
-// A part of the batch: its share of the objective, forward and backward; parts run side by side.
+// A part of the batch: its share of the objective, forward and backward.
 struct Part {
     Batch batch;
     double loss = 0, entropy = 0;  // its share of L and H-bar
@@ -822,12 +833,13 @@ struct Part {
 };
 
 void learn_part(Run& run, Part& part, uint32_t number) {
-    const uint32_t parts = static_cast<uint32_t>(run.tapes.size()),
+    const uint32_t parts = static_cast<uint32_t>(run.parts.count),
                    windows = static_cast<uint32_t>(run.agent.settings.batch_size);
-    Tape<float>& tape = *run.tapes[number];
+    Tape<float>& tape = *run.tapes[number % run.tapes.size()];
     tape.reset();
     tape.recording = true;
-    tape.block = number;
+    tape.part = number;
+    tape.block = number % run.tapes.size();
     tape.dropout_random = run.random(Stream::dropout);
     tape.dropout_step = run.progress.updates;
     part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
@@ -850,16 +862,20 @@ void learn_part(Run& run, Part& part, uint32_t number) {
 
 // One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
 void update(Run& run) {
-    std::vector<Part> parts(run.tapes.size());
+    std::vector<Part> parts(run.parts.count);
     run.memory.refresh_index();
-    run.compute.threads.run(static_cast<int>(parts.size()), [&](int number, int) {
+    const auto learn = [&](int number, int) {
         Part& part = parts[static_cast<size_t>(number)];
         try {
             learn_part(run, part, static_cast<uint32_t>(number));
         } catch (...) {
             part.problem = std::current_exception();
         }
-    });
+    };
+    if (run.parts.side_by_side)
+        run.compute.threads.run(static_cast<int>(parts.size()), learn);
+    else
+        for (size_t part = 0; part < parts.size(); ++part) learn(static_cast<int>(part), 0);
     double loss = 0, entropy = 0;
     for (const Part& part : parts) {
         if (part.problem) std::rethrow_exception(part.problem);
@@ -2076,8 +2092,7 @@ void command_bench(const Arguments& arguments) {
     for (const Kernel* kernel : kernels)
         if (kernel->supported() && (arguments["--kernel"] == "auto" || kernel == &chosen)) bench_products(*kernel);
     std::printf("%s:\n", chosen.name);
-    for (const char* preset : {"small", "paper"})
-        for (int count = 1; count <= threads; count *= 2) bench_update(chosen, count, preset);
+    bench_updates(chosen, threads);
     for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(entries);
 }
 

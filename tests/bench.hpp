@@ -4,6 +4,8 @@
 // Included by wodtem.cpp, after training. Leaves out: judging; a test never looks at a clock.
 #pragma once
 
+#include <sys/resource.h>
+
 double seconds_of(const std::function<void()>& work) {
     const auto begin = Console::Clock::now();
     work();
@@ -73,23 +75,50 @@ void bench_products(const Kernel& kernel) {
     }
 }
 
-// Arithmetic of one update that the action prediction needs, K = 1 and one layer: forward 14 d^2 products a window, and
-// twice that backward.
-void bench_update(const Kernel& kernel, int threads, const char* preset) {
+// Arithmetic of one update that the action prediction needs (2 a multiply-add; forward, and twice that backward), with
+// whole windows of C steps: 3C - 1 tokens in every layer but the last, which needs keys and values of all tokens and the
+// rest for the C state tokens; attention sees half of the tokens on average.
+double update_flops(const Settings& settings) {
+    const double d = static_cast<double>(settings.width), C = static_cast<double>(settings.context_length);
+    const double tokens = 3 * C - 1, whole_layer = tokens * (12 * d * d + tokens * d),
+                 last_layer = tokens * 2 * d * d + C * (10 * d * d + tokens * d);
+    return 6 * static_cast<double>(settings.batch_size) *
+           (static_cast<double>(settings.layers - 1) * whole_layer + last_layer);
+}
+
+template <class Environment>
+void bench_update(const Kernel& kernel, int threads, const char* what, const Settings& settings,
+                  const Environment& environment) {
     Compute compute(kernel, threads);
-    const Settings settings = default_settings("gridworld", "wodtem", preset);
-    const GridWorld world;
-    Run run(compute, settings, world.spec());
-    begin_run(run, make_data_set(settings, world));
-    const int repeats = std::string(preset) == "small" ? 200 : 1;
-    const Spread time = timed(7, [&] {
+    Run run(compute, settings, environment.spec());
+    begin_run(run, make_data_set(settings, environment));
+    const int repeats = std::max(1, static_cast<int>(1e9 / update_flops(settings)));
+    const Spread time = timed(update_flops(settings) > 1e11 ? 3 : 7, [&] {
         for (int i = 0; i < repeats; ++i) update(run);
     });
-    const double flops = 84.0 * static_cast<double>(settings.width * settings.width * settings.batch_size) * repeats;
-    std::printf("  WODTEM update, preset %-5s (width %3lld), %d thread%s  %8.3f ms (%.3f to %.3f)  %6.1f GFLOP/s\n",
-                preset, static_cast<long long>(settings.width), threads, threads == 1 ? " " : "s",
-                time.median / repeats * 1e3, time.low / repeats * 1e3, time.high / repeats * 1e3,
-                flops / time.median / 1e9);
+    std::printf("  WODTEM update, %-28s %d thread%s %9.3f ms (%.3f to %.3f)  %6.1f GFLOP/s of %.4g GFLOP\n", what,
+                threads, threads == 1 ? " " : "s", time.median / repeats * 1e3, time.low / repeats * 1e3,
+                time.high / repeats * 1e3, update_flops(settings) * repeats / time.median / 1e9,
+                update_flops(settings) / 1e9);
+}
+
+void bench_updates(const Kernel& kernel, int threads) {
+    for (int count = 1; count <= threads; count *= 2) {
+        for (const char* preset : {"small", "paper"}) {
+            const Settings settings = default_settings("gridworld", "wodtem", preset);
+            bench_update(kernel, count,
+                         std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
+                         settings, GridWorld{});
+        }
+#ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
+        const Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
+        bench_update(kernel, count, "halfcheetah, preset paper", gym,
+                     MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
+#endif
+    }
+    rusage use{};
+    getrusage(RUSAGE_SELF, &use);
+    std::printf("  peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
 }
 
 // Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.

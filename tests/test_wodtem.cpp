@@ -401,6 +401,27 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
     CHECK(short_pairs > 0 && short_pairs < 512);
 }
 
+// Dropout off: each part has masks of its own. Sums in another order, hence not the same bits.
+TEST(a_batch_in_parts_is_the_batch_as_a_whole) {
+    Settings settings = tiny_settings("wodtem");
+    for (auto [name, value] : {std::pair{"dropout", "0"}, {"context_length", "3"}, {"batch_size", "30"}})
+        set_setting(settings, name, value);
+    Fixture whole(settings), parts(settings);
+    whole.run.parts = {1, false};
+    parts.run.parts = {7, false};
+    for (int i = 0; i < 3; ++i) {
+        update(whole.run), update(parts.run);
+        CHECK_CLOSE(parts.run.progress.loss, whole.run.progress.loss, 1e-5);
+        CHECK_CLOSE(parts.run.progress.entropy, whole.run.progress.entropy, 1e-5);
+        CHECK_EQUAL(parts.run.progress.pairs, whole.run.progress.pairs);
+        CHECK_CLOSE(parts.run.progress.gradient_norm, whole.run.progress.gradient_norm, 1e-4);
+    }
+    for (size_t p = 0; p < whole.run.agent.model.parameters.size(); ++p)
+        for (size_t i = 0; i < whole.run.agent.model.parameters[p].value.size(); ++i)
+            CHECK_CLOSE(parts.run.agent.model.parameters[p].value[i], whole.run.agent.model.parameters[p].value[i],
+                        1e-4);
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Acting
 
