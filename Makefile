@@ -16,7 +16,7 @@ CXX = g++
 # -fno-math-errno: a square root is an instruction.
 CXXFLAGS = -std=c++20 -O3 -pthread -ffp-contract=off -fno-math-errno \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
-HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml tests/*.hpp)
+HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml data/policies/* tests/*.hpp)
 # Asked when it is needed, after `packages`.
 LIBRARIES = $(shell $(CXX) -E -x c++ -include mujoco/mujoco.h /dev/null >/dev/null 2>&1 && echo -lmujoco)
 TESTS = $(patsubst tests/%.cpp,%,$(wildcard tests/*.cpp))

@@ -88,7 +88,7 @@ inline std::vector<MazeCell> cells_marked(std::string_view map, char mark) {
 
 enum class Rules { hopper, walker2d, halfcheetah, ant, maze2d, antmaze };
 
-constexpr double unlimited = std::numeric_limits<double>::infinity();
+constexpr double no_limit = std::numeric_limits<double>::infinity();
 
 struct MujocoTask {
     const char *name, *version;  // together the id: hopper-v2; D4RL's data sets put their level between the two
@@ -111,14 +111,14 @@ constexpr std::array<MujocoTask, 9> mujoco_tasks{{
     {"hopper", "-v2", Rules::hopper, "hopper", nullptr, 11, 3, 1, 10, 4, 1000, 0.001, 0.005, false, -20.272305, 3234.3},
     {"walker2d", "-v2", Rules::walker2d, "walker2d", nullptr, 17, 6, 1, 10, 4, 1000, 0.001, 0.005, false, 1.629008,
      4592.3},
-    {"halfcheetah", "-v2", Rules::halfcheetah, "halfcheetah", nullptr, 17, 6, 1, unlimited, 5, 1000, 0.1, 0.1, true,
+    {"halfcheetah", "-v2", Rules::halfcheetah, "halfcheetah", nullptr, 17, 6, 1, no_limit, 5, 1000, 0.1, 0.1, true,
      -280.178953, 12135.0},
-    {"ant", "-v2", Rules::ant, "ant", nullptr, 111, 8, 2, unlimited, 5, 1000, 0.5, 0.1, true, -325.6, 3879.7},
-    {"maze2d-umaze", "-v1", Rules::maze2d, "", umaze_map, 4, 2, 0, unlimited, 1, 300, 0, 0.1, true, 23.85, 161.86},
-    {"maze2d-medium", "-v1", Rules::maze2d, "", medium_map, 4, 2, 0, unlimited, 1, 600, 0, 0.1, true, 13.13, 277.39},
-    {"maze2d-large", "-v1", Rules::maze2d, "", large_map, 4, 2, 0, unlimited, 1, 800, 0, 0.1, true, 6.7, 273.99},
-    {"antmaze-umaze", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, unlimited, 5, 700, 0, 0.1, true, 0, 1},
-    {"antmaze-umaze-diverse", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, unlimited, 5, 700, 0, 0.1, true, 0,
+    {"ant", "-v2", Rules::ant, "ant", nullptr, 111, 8, 2, no_limit, 5, 1000, 0.5, 0.1, true, -325.6, 3879.7},
+    {"maze2d-umaze", "-v1", Rules::maze2d, "", umaze_map, 4, 2, 0, no_limit, 1, 300, 0, 0.1, true, 23.85, 161.86},
+    {"maze2d-medium", "-v1", Rules::maze2d, "", medium_map, 4, 2, 0, no_limit, 1, 600, 0, 0.1, true, 13.13, 277.39},
+    {"maze2d-large", "-v1", Rules::maze2d, "", large_map, 4, 2, 0, no_limit, 1, 800, 0, 0.1, true, 6.7, 273.99},
+    {"antmaze-umaze", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0, 1},
+    {"antmaze-umaze-diverse", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0,
      1},
 }};
 

@@ -7,7 +7,7 @@
 // One code path serves three methods: DT is the likelihood alone, offline alone; ODT adds the entropy constraint and the
 // online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
 // Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
-// Leaves out: data sets from files.
+// Leaves out: how data sets come about (data/).
 
 #include <sys/file.h>
 #include <sys/ioctl.h>
@@ -24,6 +24,8 @@
 #include <set>
 #include <variant>
 
+#include "data/collect.hpp"
+#include "data/d4rl.hpp"
 #include "data/report.hpp"
 #include "data/safetensors.hpp"
 #include "gridworld.hpp"
@@ -37,7 +39,7 @@
 
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
-    std::string physics = "none", mujoco = "none";
+    std::string physics = "none", mujoco = "none", dataset = "none", dataset_sha256 = "none";
     int64_t seed = 0;
 
     int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
@@ -64,6 +66,7 @@ struct Settings {
     int64_t data_trajectories = 500, data_seed = default_data_seed;
 
     std::map<std::string, std::string> source;  // of values that do not come from the table: name -> where from
+    std::string dataset_path;  // where the data set is on this machine; not a setting: a run may go on elsewhere
 };
 
 using Field = std::variant<bool Settings::*, int64_t Settings::*, double Settings::*, std::string Settings::*>;
@@ -90,6 +93,8 @@ inline const SettingRow setting_rows[] = {
     {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
     {"physics", &Settings::physics, 0, 0, "none|d4rl|2.2", "the task has no bodies"},
     {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
+    {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
+    {"dataset_sha256", &Settings::dataset_sha256, 0, 0, "", "of the file"},
     // The network.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
@@ -136,7 +141,7 @@ inline const SettingRow setting_rows[] = {
     {"exclude_self", &Settings::exclude_self, 0, 0, "",
      "WODTEM sec. IV-B.2: no exception is made for the state itself"},
     // The grid world.
-    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down|random",
+    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down|random|recorded",
      "chosen: the paper's statistics rule out its words"},
     {"edge", &Settings::edge, 0, 0, "clipped|stays|wraps|excluded", "chosen: fits the paper's statistics"},
     {"state_encoding", &Settings::state_encoding, 0, 0, "coordinates|one_hot", "chosen: (row, column)"},
@@ -171,8 +176,8 @@ inline const TaskRow task_rows[] = {
     {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
     {"", "", "K", "2", "WODTEM sec. V-C"},
     {"", "", "physics", "d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
-    {"", "", "behaviour", "random", "chosen: uniformly random actions, until data sets can be read"},
-    {"", "", "data_trajectories", "10", "chosen: enough to normalise states by"},
+    {"", "", "behaviour", "recorded", "the data set"},
+    {"", "", "data_trajectories", "10", "chosen, of random actions: enough to normalise states by"},
     {"", "", "data_seed", "0", "chosen"},
     {"hopper", "", "g_eval", "3600", "ODT's code"},
     {"hopper", "", "g_online", "7200", "ODT's code"},
@@ -395,9 +400,9 @@ void check_together(const Settings& settings) {
     if (gridworld != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
              gridworld ? "a table of moves: none" : "d4rl or 2.2");
-    if (gridworld == (settings.behaviour == "random"))
+    if (gridworld == (settings.behaviour == "random" || settings.behaviour == "recorded"))
         fail("usage.setting", "%s cannot have behaviour %s; it is %s", settings.task.c_str(),
-             settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "random");
+             settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "recorded or random");
 }
 
 // name = value    # source
@@ -1065,31 +1070,6 @@ constexpr const char* progress_header =
     "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,physics\n";
 constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions,physics\n";
 
-struct Saver {
-    static constexpr bool loading = false;
-    TensorFile& file;
-    template <class T>
-    void operator()(const std::string& name, const std::vector<T>& values) {
-        file.add(name, {values.size()}, values);
-    }
-    template <class T>
-    requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T value) { file.add(name, {}, std::array{value}); }
-};
-
-struct Loader {
-    static constexpr bool loading = true;
-    const TensorFile& file;
-    template <class T>
-    void operator()(const std::string& name, std::vector<T>& values) {
-        const uint64_t n = file.find(name).shape.empty() ? 1 : file.find(name).shape[0];
-        values = file.get<T>(name, {n});
-    }
-    template <class T>
-    requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T& value) { value = file.get<T>(name, {})[0]; }
-};
-
 // Everything in Run that is state, in the order of its members; saving and loading read the same list.
 template <class Archive>
 void visit_state(Archive& archive, Run& run) {
@@ -1104,13 +1084,8 @@ void visit_state(Archive& archive, Run& run) {
                      {".value.", parameters[i].value},
                      {".first_moment.", state.first_moment[i]},
                      {".second_moment.", state.second_moment[i]}}) {
-                values.resize(size);  // moments that no update has touched yet are zeros
-                std::vector<float> saved = values;
-                archive(name + part + parameters[i].name, saved);
-                if (saved.size() != size)
-                    fail("checkpoint.shape", "%s%s%s has %zu values, expected %zu", name.c_str(), part,
-                         parameters[i].name.c_str(), saved.size(), size);
-                std::copy(saved.begin(), saved.end(), values.begin());  // in place: the network's tensors point there
+                values.resize(size);                                // moments that no update has touched yet are zeros
+                archive(name + part + parameters[i].name, values);  // in place: the network's tensors point there
             }
         }
     };
@@ -1118,9 +1093,7 @@ void visit_state(Archive& archive, Run& run) {
     archive("normaliser.mean", run.agent.normaliser.mean);
     archive("normaliser.deviation", run.agent.normaliser.deviation);
     optimizer("temperature", run.temperature.log_lambda, run.temperature.optimizer);
-    if (Archive::loading && run.progress.online == 0)
-        run.replay.capacity = static_cast<size_t>(run.agent.settings.data_trajectories);
-    run.replay.visit(archive);
+    if (run.progress.online != 0) run.replay.visit(archive);  // before, it is the data set
     run.memory.visit(archive);
 }
 
@@ -1326,15 +1299,19 @@ void save_results(Run& run, const GridWorld& world, const RunFolder& folder) {
 
 #ifdef WODTEM_MUJOCO
 
-// Uniformly random actions. A trajectory that the engine spoils is no data: the next one takes its place.
+// The data set's file, or uniformly random actions: there a trajectory that the engine spoils is no data, and the next
+// one takes its place.
 std::vector<Trajectory> make_data_set(const Settings& settings, MujocoEnvironment environment) {
     const EnvironmentSpec spec = environment.spec();
     std::vector<Trajectory> trajectories;
-    for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
-        if (auto trajectory = random_trajectory(environment, static_cast<uint32_t>(settings.data_seed), number)) {
-            relabel(*trajectory, spec.state_dim, spec.action_dim, settings.gamma);
+    if (settings.behaviour == "recorded")
+        trajectories = cut_trajectories(read_data_set(settings.dataset_path), *environment.task, settings.dataset_path);
+    for (uint64_t number = 0;
+         settings.behaviour == "random" && trajectories.size() < static_cast<size_t>(settings.data_trajectories);
+         ++number)
+        if (auto trajectory = random_trajectory(environment, static_cast<uint32_t>(settings.data_seed), number))
             trajectories.push_back(std::move(*trajectory));
-        }
+    for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
     return trajectories;
 }
 
@@ -1595,13 +1572,19 @@ void online_phase(Run& run, Session<Environment>& session) {
 // ---------------------------------------------------------------------------------------------------------------------
 // train
 
-// D_offline, its statistics, and the memory's first contents.
-void begin_run(Run& run, std::vector<Trajectory> data_set) {
+// D_offline.
+void fill_replay(Run& run, std::vector<Trajectory> data_set) {
+    data_set = offline_set(std::move(data_set), run.agent.settings.keep_lowest);
+    run.replay.capacity = data_set.size();
+    run.replay.start(std::move(data_set));
+}
+
+// D_offline, its statistics, and the memory's first contents, in the order of the data set.
+void begin_run(Run& run, const std::vector<Trajectory>& data_set) {
     run.agent.normaliser = fit_normaliser(data_set, run.agent.spec.state_dim);
-    run.replay.trajectories = offline_set(std::move(data_set), run.agent.settings.keep_lowest);
-    run.replay.capacity = run.replay.trajectories.size();
-    for (const Trajectory& trajectory : run.replay.trajectories) remember(run, trajectory);
-    run.replay.start(std::move(run.replay.trajectories));
+    for (const Trajectory& trajectory : offline_set(data_set, run.agent.settings.keep_lowest))
+        remember(run, trajectory);
+    fill_replay(run, data_set);
 }
 
 // A folder may be new, hold this very run, or hold another: then nothing is touched.
@@ -1659,6 +1642,7 @@ void train_in(const Environment& environment, const Settings& settings, const st
     Run run(compute, settings, environment.spec());
     if (fs::exists(session.folder.file("checkpoint.safetensors"))) {
         load_checkpoint(run, session.folder);
+        if (run.progress.online == 0) fill_replay(run, make_data_set(settings, environment));
         std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(),
                      static_cast<unsigned long long>(run.progress.updates));
     } else {
@@ -1763,14 +1747,30 @@ int thread_count(const Arguments& arguments) {
     return asked > 0 ? static_cast<int>(asked) : static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
 }
 
+// `given`: a file; "random": none, ten episodes of random actions and the online phase alone; "": the file of the task's
+// id, where there is one by that name. Errors: dataset.missing.
+void choose_data_set(Settings& settings, const std::string& given) {
+    const PublishedDataSet* published = find_published(settings.task);
+    if (given == "random" || (given.empty() && !published)) {
+        set_from(settings, "behaviour", "random", "chosen: there is no data set");
+        if (settings.method != "dt")
+            set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
+        return;
+    }
+    settings.dataset_path = given.empty() ? find_data_set(*published) : given;
+    settings.dataset_sha256 = sha256_of_file(settings.dataset_path);
+    settings.dataset = fs::path(settings.dataset_path).filename();
+    const bool original = published && settings.dataset_sha256 == published->sha256;
+    settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
+}
+
 Settings asked_settings(const Arguments& arguments, int64_t seed) {
     Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
     settings.seed = seed;
     settings.arithmetic = choose_kernel(arguments["--kernel"]).fused ? "fused" : "plain";
     if (settings.task != "gridworld") {
         settings.mujoco = mujoco_version();
-        if (settings.method != "dt")
-            set_from(settings, "offline_updates", "0", "there is no data set yet: the online phase alone");
+        choose_data_set(settings, arguments["--dataset"]);
     }
     if (!arguments["--physics"].empty()) set_from(settings, "physics", arguments["--physics"], "command line");
     std::set<std::string> seen;
@@ -1780,7 +1780,8 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
             fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
         const std::string name = assignment.substr(0, equals);
         const std::string row = setting_row(name).name;
-        for (const char* fixed : {"task", "method", "preset", "seed", "arithmetic", "mujoco"})
+        for (const char* fixed :
+             {"task", "method", "preset", "seed", "arithmetic", "mujoco", "dataset", "dataset_sha256"})
             if (row == fixed) fail("usage.setting", "%s is not given by --set; see wodtem train --help", fixed);
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
@@ -1863,6 +1864,54 @@ void command_eval(const Arguments& arguments) {
     const Settings settings = settings_from_text(file.text("settings"), file.path);
     with_environment(settings,
                      [&](const auto& environment) { evaluate_model(environment, settings, file, arguments); });
+}
+
+// Steps of D4RL's own sets.
+int64_t published_steps(const std::string& id) {
+    return id == "maze2d-large-v1" ? 4000000 : id == "maze2d-medium-v1" ? 2000000 : 1000000;
+}
+
+void command_collect(const Arguments& arguments) {
+    const std::string id = full_task_name(arguments.words[0]);
+    const PublishedDataSet* set = find_published(id);
+    if (!set) {
+        std::vector<std::string> names;
+        for (const PublishedDataSet& one : published_data_sets) names.push_back(one.id);
+        fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none; the nearest is %s", id.c_str(),
+             nearest_name(id, names).c_str());
+    }
+    const int64_t steps = arguments["--steps"].empty() ? published_steps(id)
+                                                       : whole_number(arguments["--steps"], "--steps", 1, 100000000);
+    const int64_t seed = whole_number(arguments["--seed"].empty() ? "0" : arguments["--seed"], "--seed", 0, 2147483647);
+    const std::string path =
+        arguments["--out"].empty() ? std::string(own_folder) + "/" + file_name(*set) : arguments["--out"];
+#ifdef WODTEM_MUJOCO
+    std::error_code problem;
+    const fs::path folder = fs::path(path).parent_path();
+    if (!folder.empty()) fs::create_directories(folder, problem);
+    if (problem) fail("collect.folder", "cannot make the folder %s: %s", folder.c_str(), problem.message().c_str());
+    int tenth = 0;
+    const auto show = [&](size_t done) {
+        const int now = static_cast<int>(10 * static_cast<double>(done) / static_cast<double>(steps));
+        if (now > tenth && now <= 10) std::fprintf(stderr, "%s: %d%%\n", id.c_str(), 10 * now);
+        tenth = std::max(tenth, now);
+    };
+    const Origin origin{
+        "wodtem collect " + id + " --steps " + std::to_string(steps) + " --seed " + std::to_string(seed),
+        static_cast<uint32_t>(seed)};
+    const MujocoTask& task = *find_mujoco_task(id);
+    if (!has_stand_in(id))
+        fail("collect.task", "%s cannot be made by this version; maze2d, hopper-medium and halfcheetah-medium can",
+             id.c_str());
+    if (task.rules == Rules::maze2d)
+        collect_maze2d(path, task, static_cast<size_t>(steps), origin, show);
+    else
+        collect_medium(path, task, static_cast<size_t>(steps), origin, show);
+    std::printf("%s: %lld steps; see: wodtem info %s\n", path.c_str(), static_cast<long long>(steps), path.c_str());
+#else
+    fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s", path.c_str(),
+         steps + seed > 0 ? mujoco_advice : "");
+#endif
 }
 
 // ----- trace -----
@@ -1963,7 +2012,8 @@ void command_report(const Arguments& arguments) {
 // How long an update takes here, times how many there will be: offline_updates, and updates_per_iteration for each
 // episode. The episodes are not known beforehand: on the grid world the means of preset small over seeds 0 to 4 stand in
 // (README.md), elsewhere episodes that use up the time limit; shorter ones are more.
-double estimated_seconds(const Settings& settings) {
+double estimated_seconds(Settings settings) {
+    if (settings.task != "gridworld") settings.behaviour = "random";
     double seconds = 0;
     with_environment(settings, [&](const auto& environment) {
         Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
@@ -2026,8 +2076,45 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
     return text + (bad > 0 ? std::to_string(bad) : std::string());
 }
 
+// A data set in HDF5: what the file holds, then what it means. `id`: of the task, "" to go by the file's name and sums.
+void describe_data_set(const std::string& path, std::string id) {
+    const Hdf5File file = open_hdf5(path);
+    const std::string sha256 = sha256_of_file(path);
+    std::printf("%s: HDF5, %zu bytes, SHA-256 %s\n", path.c_str(), file.bytes.size(), sha256.c_str());
+    for (const PublishedDataSet& set : published_data_sets) {
+        if (sha256 == set.sha256) std::printf("This is D4RL's published file of %s.\n", set.id);
+        if (id.empty() && (sha256 == set.sha256 || fs::path(path).filename() == file_name(set))) id = set.id;
+    }
+    constexpr size_t listed = 40;
+    for (size_t i = 0; i < std::min(listed, file.datasets.size()); ++i) {
+        const Hdf5Dataset& dataset = file.datasets[i];
+        std::printf("  %-40s %-18s %-12s %zu bytes stored%s%s\n", json_string(dataset.path).c_str(),
+                    shape_text(dataset.shape).c_str(), dataset.type.c_str(), dataset.stored,
+                    dataset.unsupported.empty() ? "" : "; cannot be read: ", dataset.unsupported.c_str());
+    }
+    if (file.datasets.size() > listed) std::printf("  and %zu more\n", file.datasets.size() - listed);
+    if (!is_minari(file) && !file.find("observations")) return;
+    const Rows rows = is_minari(file) ? read_minari(file) : read_rows(file);
+    const MujocoTask* task = find_mujoco_task(id);
+    if (!task)
+        std::printf("The name tells no task, so there is no score, and flags alone end trajectories (see --task)\n");
+    const std::vector<Trajectory> trajectories = task ? cut_trajectories(rows, *task, path) : cut_at_flags(rows, 1000);
+    const DataSetStatistics statistics = statistics_of(rows, trajectories);
+    std::printf("rows:         %zu, %zu state and %zu action numbers\n%s", rows.count, rows.state_dim, rows.action_dim,
+                describe(statistics).c_str());
+    if (task)
+        std::printf("mean normalised score of a trajectory: %.2f (%s)\n",
+                    normalised_score(*task, statistics.returns.mean()), task->name);
+    const PublishedDataSet* set = find_published(id);
+    if (set && set->trajectories > 0)
+        std::printf("D4RL's: %d trajectories, returns: mean %.2f, deviation %.2f, %.2f to %.2f\n", set->trajectories,
+                    set->mean_return, set->deviation, set->low, set->high);
+}
+
 void command_info(const Arguments& arguments) {
     const std::string& path = arguments.words[0];
+    if (is_hdf5(path))
+        return describe_data_set(path, arguments["--task"].empty() ? "" : full_task_name(arguments["--task"]));
     const std::string bytes = read_file(path);
     const uint32_t checksum = crc32(bytes);
     const TensorFile file = parse_safetensors(bytes, path);
@@ -2109,6 +2196,7 @@ const std::vector<Command>& commands() {
           seeds_option,
           set_option,
           physics_option,
+          {"--dataset", "FILE", "", "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
           {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
           kernel_option,
           threads_option,
@@ -2121,6 +2209,15 @@ const std::vector<Command>& commands() {
          "evaluate a saved model; needs nothing else",
          {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option},
          command_eval},
+        {"collect",
+         "ID",
+         1,
+         1,
+         "make a stand-in for one of D4RL's data sets, in its layout",
+         {{"--out", "FILE", "", "where to write (default: runs/datasets under D4RL's file name)"},
+          {"--steps", "N", "", "rows (default: as many as D4RL's)"},
+          seed_option},
+         command_collect},
         {"trace",
          "TASK",
          1,
@@ -2145,7 +2242,13 @@ const std::vector<Command>& commands() {
           preset_option,
           {"--estimate", nullptr, "", "say how long the runs would take, as comments"}},
          command_sweep},
-        {"info", "FILE", 1, 1, "what is in a model or checkpoint: names, shapes, ranges, checksum", {}, command_info},
+        {"info",
+         "FILE",
+         1,
+         1,
+         "what is in a data set, a model or a checkpoint, and what it means",
+         {{"--task", "ID", "", "of a data set whose name does not tell"}},
+         command_info},
         {"bench",
          "[WHAT]",
          0,

@@ -602,3 +602,32 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
 }
 
 inline TensorFile read_safetensors(const std::string& path) { return parse_safetensors(read_file(path), path); }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Archives, for state that lists its fields once: visit(archive) calls archive(name, field) for each of them.
+
+struct Saver {
+    static constexpr bool loading = false;
+    TensorFile& file;
+    template <class T>
+    void operator()(const std::string& name, const std::vector<T>& values) {
+        file.add(name, {values.size()}, values);
+    }
+    template <class T>
+    requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T value) { file.add(name, {}, std::array{value}); }
+};
+
+// A vector that is empty takes whatever size is there, another keeps its own.
+struct Loader {
+    static constexpr bool loading = true;
+    const TensorFile& file;
+    template <class T>
+    void operator()(const std::string& name, std::vector<T>& values) {
+        if (values.empty()) values.resize(file.find(name).size / sizeof(T));
+        file.read_into(std::span<T>(values), name, {values.size()});
+    }
+    template <class T>
+    requires std::is_arithmetic_v<T>
+    void operator()(const std::string& name, T& value) { value = file.get<T>(name, {})[0]; }
+};

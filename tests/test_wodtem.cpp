@@ -661,7 +661,7 @@ TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
         }
     }
     write_safetensors(path, other);
-    CHECK_FAILS("checkpoint.shape", quiet_train(tiny_settings("wodtem"), scratch / "run"));
+    CHECK_FAILS("safetensors.shape", quiet_train(tiny_settings("wodtem"), scratch / "run"));
 
     write_file_atomic(path, good);
     const std::string episodes = read_file(scratch / "run/episodes.csv");
@@ -742,6 +742,27 @@ TEST(numbers_that_are_not_finite_stop_the_run_and_name_the_tensor) {
     }
 }
 
+// The program itself.
+namespace {
+struct Outcome {
+    int status;
+    std::string text;
+};
+Outcome shell(const std::string& command) {
+    FILE* pipe = popen((command + " 2>&1").c_str(), "r");
+    Outcome outcome = {0, ""};
+    for (int c; (c = std::fgetc(pipe)) != EOF;) outcome.text += static_cast<char>(c);
+    outcome.status = WEXITSTATUS(pclose(pipe));
+    return outcome;
+}
+void check_shell(const std::string& command, int status, const std::string& part) {
+    const Outcome outcome = shell(command);
+    if (outcome.status != status || outcome.text.find(part) == std::string::npos)
+        report_failure(__FILE__, __LINE__,
+                       command + ": status " + std::to_string(outcome.status) + ", said: " + outcome.text);
+}
+}  // namespace
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Episodes that the physics engine spoils, and runs on the MuJoCo tasks
 
@@ -817,6 +838,7 @@ Settings tiny_mujoco_settings(const std::string& task, const std::string& method
                                                                                          {"eval_episodes", "3"},
                                                                                          {"warmup_updates", "10"},
                                                                                          {"data_trajectories", "3"},
+                                                                                         {"behaviour", "random"},
                                                                                          {"buffer_size", "5"}})
         set_setting(settings, name, value);
     if (method != "dt") set_setting(settings, "online_steps", task.starts_with("hopper") ? "120" : "1000");
@@ -850,6 +872,41 @@ TEST(mujoco_runs_depend_on_neither_threads_nor_interruptions) {
     }
 }
 
+TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
+    const Scratch scratch;
+    const std::string data = scratch / "maze.hdf5";
+    check_shell("./wodtem collect maze2d-umaze --steps 3000 --out " + data, 0, "3000 steps");
+    check_shell("./wodtem info " + data + " --task maze2d-umaze", 0,
+                "rows:         3000, 4 state and 2 action numbers");
+    check_shell("./wodtem info " + data, 0, "no task");
+    Settings settings = tiny_mujoco_settings("maze2d-umaze-v1", "wodtem");
+    set_setting(settings, "behaviour", "recorded");
+    settings.dataset_path = data;
+    settings.dataset_sha256 = sha256_of_file(data);
+    quiet_train(settings, scratch / "whole");
+    stop_requested = 1;  // in the offline phase, whose replay buffer is made again from the file
+    CHECK_FAILS("run.stopped", quiet_train(settings, scratch / "stopped", 2));
+    stop_requested = 0;
+    quiet_train(settings, scratch / "stopped", 2);
+    for (const char* name : {"progress.csv", "episodes.csv", "model.safetensors", "paths.csv"})
+        CHECK(read_file(scratch / (std::string("whole/") + name)) ==
+              read_file(scratch / (std::string("stopped/") + name)));
+    const Table progress = parse_csv(read_file(scratch / "whole/progress.csv"), "progress.csv");
+    CHECK_EQUAL(progress.rows[0][0], "offline");
+    CHECK(std::stod(progress.rows[0][5]) > 0);  // something was learned from
+    settings.task = "antmaze-umaze-v2";
+    CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
+
+    const std::string nowhere = "D4RL_DATASET_DIR=" + (scratch / "none") + " ";
+    if (!fs::exists(std::string(own_folder) + "/walker2d_medium-v2.hdf5"))
+        check_shell(nowhere + "./wodtem train walker2d-medium", 1, "--dataset FILE");
+    check_shell("./wodtem train hopper-medium --dataset " + (scratch / "none.hdf5"), 1, "none.hdf5");
+    check_shell("./wodtem train maze2d-umaze --dataset README.md --out " + (scratch / "text"), 1, "README.md");
+    check_shell("./wodtem collect hopper", 2, "nearest is");
+    check_shell("./wodtem collect antmaze-umaze --out " + (scratch / "x.hdf5"), 1, "cannot be made");
+    check_shell("./wodtem collect maze2d-umaze --steps 0", 2, "nearest is 1");
+}
+
 TEST(every_method_and_physics_trains_on_continuous_actions) {
     const Scratch scratch;
     for (const char* method : {"dt", "odt"}) quiet_train(tiny_mujoco_settings("hopper-v2", method), scratch / method);
@@ -874,26 +931,6 @@ TEST(every_method_and_physics_trains_on_continuous_actions) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The command line, through the program itself
 
-namespace {
-struct Outcome {
-    int status;
-    std::string text;
-};
-Outcome shell(const std::string& command) {
-    FILE* pipe = popen((command + " 2>&1").c_str(), "r");
-    Outcome outcome = {0, ""};
-    for (int c; (c = std::fgetc(pipe)) != EOF;) outcome.text += static_cast<char>(c);
-    outcome.status = WEXITSTATUS(pclose(pipe));
-    return outcome;
-}
-void check_shell(const std::string& command, int status, const std::string& part) {
-    const Outcome outcome = shell(command);
-    if (outcome.status != status || outcome.text.find(part) == std::string::npos)
-        report_failure(__FILE__, __LINE__,
-                       command + ": status " + std::to_string(outcome.status) + ", said: " + outcome.text);
-}
-}  // namespace
-
 TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem", 2, "wodtem COMMAND --help");
     check_shell("./wodtem --help", 0, "report");
@@ -911,7 +948,7 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train hopper --physics 2.3", 2, "none|d4rl|2.2");
     check_shell("./wodtem train hopper --physics none", 2, "d4rl or 2.2");
     check_shell("./wodtem train gridworld --physics 2.2", 2, "cannot have physics");
-    check_shell("./wodtem train hopper --set behaviour=left_down", 2, "it is random");
+    check_shell("./wodtem train hopper --set behaviour=left_down", 2, "it is recorded or random");
     check_shell("./wodtem trace gridworld", 2, "MuJoCo");
     check_shell("./wodtem trace nothing", 2, "nearest is");
     check_shell("./wodtem trace hopper --physics old", 2, "none|d4rl|2.2");

@@ -1,0 +1,352 @@
+// d4rl.hpp: data sets in D4RL's and Minari's layouts: where they are found, what they hold, and the trajectories in them.
+//
+// A D4RL file is one table of steps in the order in which they were taken (HDF5; N steps):
+//   observations (N, S), actions (N, A), rewards (N), terminals (N): the task ended the episode in this step,
+//   timeouts (N): the time limit did; next_observations (N, S) in the gym tasks alone; infos and metadata are not used.
+// Where an episode ends differs by family; cut_trajectories() has the rules. Minari: a group episode_0, episode_1, ...
+// for each, with one more observation than actions, and terminations and truncations.
+// Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN or
+// of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), training, writing.
+#pragma once
+
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <map>
+#include <optional>
+
+#include "../memory.hpp"
+#include "../mujoco_env.hpp"
+#include "hdf5.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What is published. Files and checksums: as TensorFlow Datasets records them; statistics: its catalogue, and comments of
+// public decision transformers. NaN and 0: not published.
+
+struct PublishedDataSet {
+    const char* id;
+    const char* file;  // below the address
+    uint64_t bytes;
+    const char* sha256;
+    int trajectories;  // complete ones
+    double mean_return, deviation, high, low;
+};
+constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
+constexpr std::array<PublishedDataSet, 13> published_data_sets{{
+    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 152756557,
+     "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0", 2186, 1422.06, 378.95, 3222.36, 315.87},
+    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 75854457,
+     "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 2041, 467.30, 511.03, 3192.93, -1.44},
+    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 232254996,
+     "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 1190, 2852.09, 1095.44, 4226.94, -6.61},
+    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 86323963,
+     "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 1093, 682.70, 895.96, 4132.00, -50.20},
+    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 237727262,
+     "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 1000, 4770.33, 355.75, 5309.38, -310.23},
+    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 59448533,
+     "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 202, 3093.29, 1680.69, 4985.14, -638.49},
+    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 376239825,
+     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 1202, NAN, NAN, NAN, NAN},
+    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 136482252,
+     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 485, NAN, NAN, NAN, NAN},
+    {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
+     232532949, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", 0, NAN, NAN, NAN, NAN},
+    {"antmaze-umaze-diverse-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_True_multigoal_True_sparse_fixed.hdf5",
+     230854272, "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932", 0, NAN, NAN, NAN, NAN},
+    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 0, "", 0, NAN, NAN, NAN, NAN},
+    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 0, "", 0, NAN, NAN, NAN, NAN},
+    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 0, "", 0, NAN, NAN, NAN, NAN},
+}};
+
+inline const PublishedDataSet* find_published(std::string_view id) {
+    for (const PublishedDataSet& set : published_data_sets)
+        if (id == set.id) return &set;
+    return nullptr;
+}
+
+// Its name without folders, as D4RL saves it.
+inline std::string file_name(const PublishedDataSet& set) { return std::filesystem::path(set.file).filename(); }
+
+constexpr const char* own_folder = "runs/datasets";
+
+// Whether collect.hpp can make something of the kind.
+inline bool has_stand_in(std::string_view id) {
+    return id.starts_with("maze2d-") || id == "hopper-medium-v2" || id == "halfcheetah-medium-v2";
+}
+
+// D4RL's cache: where its environment variable says, else in the home folder.
+inline std::string d4rl_folder() {
+    if (const char* folder = std::getenv("D4RL_DATASET_DIR"); folder && *folder) return folder;
+    const char* home = std::getenv("HOME");
+    return std::string(home ? home : ".") + "/.d4rl/datasets";
+}
+
+// The file of a data set: D4RL's own, else ours. Errors: dataset.missing says where it looked and what to do.
+inline std::string find_data_set(const PublishedDataSet& set) {
+    const std::string name = file_name(set);
+    std::string looked;
+    for (const std::string& folder : {d4rl_folder(), std::string(own_folder)}) {
+        const std::string path = folder + "/" + name;
+        if (std::filesystem::exists(path)) return path;
+        looked += (looked.empty() ? "" : " and ") + path;
+    }
+    const bool made = has_stand_in(set.id);
+    fail("dataset.missing", "the data set of %s is not here: looked for %s. The original is published at %s%s%s%s",
+         set.id, looked.c_str(), published_address, set.file,
+         made ? "; a stand-in is made in minutes by: wodtem collect " : "; give it with --dataset FILE",
+         made ? set.id : "");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The rows of a file.
+
+struct Rows {
+    size_t count = 0, state_dim = 0, action_dim = 0;
+    std::vector<float> observations, next_observations;  // [count, state_dim]; the second may be empty
+    std::vector<float> actions, rewards;                 // [count, action_dim], [count]
+    std::vector<uint8_t> terminals, timeouts;            // [count]; timeouts may be empty
+
+    const float* observation(size_t row) const { return &observations[row * state_dim]; }
+};
+
+// A table [rows, columns]; a column may be (N) or (N, 1). Errors: dataset.shape, and those of hdf5.hpp.
+inline const Hdf5Dataset& table_of(const Hdf5File& file, const std::string& name, std::optional<uint64_t> rows,
+                                   std::optional<uint64_t> columns) {
+    const Hdf5Dataset* found = file.find(name);
+    if (!found)
+        fail("dataset.shape", "%s: has no data set \"%s\"; it is not in D4RL's layout", file.path.c_str(),
+             name.c_str());
+    const Shape& shape = found->shape;
+    const uint64_t width = shape.size() == 2 ? shape[1] : 1;
+    if (shape.empty() || shape.size() > 2 || (rows && shape[0] != *rows) || (columns && width != *columns))
+        fail("dataset.shape", "%s: \"%s\" has shape %s, expected %s by %s", file.path.c_str(), name.c_str(),
+             shape_text(shape).c_str(), rows ? std::to_string(*rows).c_str() : "any number",
+             columns ? std::to_string(*columns).c_str() : "any number");
+    return *found;
+}
+
+inline void check_finite_rows(const Hdf5File& file, const char* name, const std::vector<float>& values, size_t width) {
+    for (size_t i = 0; i < values.size(); ++i)
+        if (!std::isfinite(values[i]))
+            fail("dataset.not_finite", "%s: \"%s\", row %zu, column %zu is %g; only finite numbers can be learned from",
+                 file.path.c_str(), name, i / width, i % width, static_cast<double>(values[i]));
+}
+
+// Errors: dataset.shape, dataset.not_finite, those of hdf5.hpp.
+inline Rows read_rows(const Hdf5File& file) {
+    Rows rows;
+    const Shape shape = table_of(file, "observations", {}, {}).shape;
+    rows.count = shape[0];
+    rows.state_dim = shape.size() == 2 ? shape[1] : 1;
+    const Hdf5Dataset& actions = table_of(file, "actions", rows.count, {});
+    rows.action_dim = actions.shape.size() == 2 ? actions.shape[1] : 1;
+    if (rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0)
+        fail("dataset.shape", "%s: holds no steps", file.path.c_str());
+    rows.observations = file.read_floats(table_of(file, "observations", {}, {}));
+    rows.actions = file.read_floats(actions);
+    rows.rewards = file.read_floats(table_of(file, "rewards", rows.count, 1));
+    rows.terminals = file.read_flags(table_of(file, "terminals", rows.count, 1));
+    if (file.find("timeouts")) rows.timeouts = file.read_flags(table_of(file, "timeouts", rows.count, 1));
+    if (file.find("next_observations"))
+        rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim));
+    check_finite_rows(file, "observations", rows.observations, rows.state_dim);
+    check_finite_rows(file, "actions", rows.actions, rows.action_dim);
+    check_finite_rows(file, "rewards", rows.rewards, 1);
+    return rows;
+}
+
+inline bool is_minari(const Hdf5File& file) { return file.find("episode_0/observations") != nullptr; }
+
+// Minari's episodes as rows; the observation after the last action becomes the last row's next one.
+inline Rows read_minari(const Hdf5File& file) {
+    Rows rows;
+    const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
+    for (size_t episode = 0;; ++episode) {
+        const std::string group = "episode_" + std::to_string(episode) + "/";
+        const Hdf5Dataset* found = file.find(group + "observations");
+        if (!found) break;
+        const Hdf5Dataset& actions = table_of(file, group + "actions", {}, {});
+        const uint64_t steps = actions.shape[0], A = actions.shape.size() == 2 ? actions.shape[1] : 1;
+        const Hdf5Dataset& states = table_of(file, group + "observations", steps + 1, {});
+        const uint64_t S = states.shape.size() == 2 ? states.shape[1] : 1;
+        if (episode == 0) rows.state_dim = S, rows.action_dim = A;
+        if (S != rows.state_dim || A != rows.action_dim || steps == 0)
+            fail("dataset.shape",
+                 "%s: %sobservations and actions have %zu and %zu columns, %zu steps; episode 0 has "
+                 "%zu and %zu columns",
+                 file.path.c_str(), group.c_str(), static_cast<size_t>(S), static_cast<size_t>(A),
+                 static_cast<size_t>(steps), rows.state_dim, rows.action_dim);
+        const std::vector<float> all = file.read_floats(states);
+        append(rows.observations, std::span(all).first(steps * S));
+        append(rows.next_observations, std::span(all).last(steps * S));
+        append(rows.actions, file.read_floats(actions));
+        append(rows.rewards, file.read_floats(table_of(file, group + "rewards", steps, 1)));
+        append(rows.terminals, file.read_flags(table_of(file, group + "terminations", steps, 1)));
+        append(rows.timeouts, file.read_flags(table_of(file, group + "truncations", steps, 1)));
+        if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
+        rows.count += steps;
+    }
+    check_finite_rows(file, "observations", rows.observations, rows.state_dim);
+    check_finite_rows(file, "actions", rows.actions, rows.action_dim);
+    check_finite_rows(file, "rewards", rows.rewards, 1);
+    return rows;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// From rows to trajectories.
+
+inline void append_row(Trajectory& trajectory, const Rows& rows, size_t row) {
+    const float *state = rows.observation(row), *action = &rows.actions[row * rows.action_dim];
+    trajectory.states.insert(trajectory.states.end(), state, state + rows.state_dim);
+    trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
+    trajectory.rewards.push_back(rows.rewards[row]);
+}
+
+// D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last one
+// allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: collection stopped there.
+// Where a file has no timeouts (the first versions), `limit` steps end one too. The gym sets of replay buffers also have
+// timeouts at the ends of collection blocks; they cut, as in D4RL. maze2d: terminals are all 0, and timeouts mark that a
+// navigation goal was reached; the body is not reset, and the next row starts where this one ended.
+inline std::vector<Trajectory> cut_at_flags(const Rows& rows, int limit) {
+    std::vector<Trajectory> trajectories;
+    Trajectory trajectory;
+    for (size_t row = 0; row < rows.count; ++row) {
+        append_row(trajectory, rows, row);
+        const bool terminal = rows.terminals[row] != 0;
+        if (!(terminal || (rows.timeouts.empty() ? trajectory.length() == limit : rows.timeouts[row] != 0))) continue;
+        trajectory.terminated = terminal;
+        trajectories.push_back(std::exchange(trajectory, {}));
+    }
+    return trajectories;
+}
+
+// ODT's code for antmaze: of D4RL's Q-learning tuples (s_t, a_t, r_t, s_{t+1} = the next row; rows with a timeout and the
+// very last row left out), a trajectory ends at a terminal, where the next tuple does not go on from s_{t+1}, and with
+// the last tuple. In umaze-v2 episodes go on after success, with a terminal in every row at the goal: each becomes a
+// trajectory of one step and return 1, as in ODT.
+inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
+    std::vector<Trajectory> trajectories;
+    Trajectory trajectory;
+    const auto is_tuple = [&](size_t row) {
+        return row + 1 < rows.count && (rows.timeouts.empty() || rows.timeouts[row] == 0);
+    };
+    for (size_t row = 0; row + 1 < rows.count;) {
+        size_t next = row + 1;
+        if (!is_tuple(row)) {
+            row = next;
+            continue;
+        }
+        append_row(trajectory, rows, row);
+        while (next < rows.count && !is_tuple(next)) ++next;
+        double jump = 0;
+        for (size_t i = 0; next < rows.count && i < rows.state_dim; ++i) {
+            const double difference = static_cast<double>(rows.observation(next)[i]) - rows.observation(row + 1)[i];
+            jump += difference * difference;
+        }
+        const bool terminal = rows.terminals[row] != 0;
+        if (terminal || next >= rows.count || jump > 1e-12) {  // 1e-6 in norm
+            trajectory.terminated = terminal;
+            trajectories.push_back(std::exchange(trajectory, {}));
+        }
+        row = next;
+    }
+    return trajectories;
+}
+
+// Errors: dataset.task if the rows are not of this task's size, dataset.empty.
+inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTask& task, const std::string& path) {
+    if (rows.state_dim != static_cast<size_t>(task.state_dim) ||
+        rows.action_dim != static_cast<size_t>(task.action_dim))
+        fail("dataset.task",
+             "%s: has %zu state and %zu action numbers a step; %s has %d and %d: is it of another task?", path.c_str(),
+             rows.state_dim, rows.action_dim, task.name, task.state_dim, task.action_dim);
+    std::vector<Trajectory> trajectories =
+        task.rules == Rules::antmaze ? cut_tuples(rows) : cut_at_flags(rows, task.max_episode_steps);
+    if (trajectories.empty())
+        fail("dataset.empty", "%s: no step is marked as the end of a trajectory, so there is none", path.c_str());
+    return trajectories;
+}
+
+inline bool is_hdf5(const std::string& path) {
+    char first[8] = {};
+    std::ifstream(path, std::ios::binary).read(first, 8);
+    return std::string_view(first, 8) == "\211HDF\r\n\032\n";
+}
+
+inline Rows read_data_set(const std::string& path) {
+    const Hdf5File file = open_hdf5(path);
+    return is_minari(file) ? read_minari(file) : read_rows(file);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What a data set is like, for `wodtem info`.
+
+struct Moments {
+    double count = 0, sum = 0, squares = 0, low = INFINITY, high = -INFINITY;
+    void add(double x) { ++count, sum += x, squares += x * x, low = std::min(low, x), high = std::max(high, x); }
+    double mean() const { return sum / count; }
+    double deviation() const {
+        return std::sqrt(std::max(0.0, squares / count - mean() * mean()));
+    }  // with 1/n, as D4RL's
+    std::string text() const {
+        char line[160];
+        std::snprintf(line, sizeof line, "mean %.2f, deviation %.2f, %.2f to %.2f", mean(), deviation(), low, high);
+        return line;
+    }
+};
+
+struct DataSetStatistics {
+    Moments lengths, returns, actions;
+    size_t terminated = 0;    // trajectories that the task ended
+    size_t left_out = 0;      // rows in no trajectory
+    size_t dead_columns = 0;  // of the state: always the same number
+    size_t repeated = 0;      // rows whose observation is that of the row before
+    size_t jumps = 0;         // rows within a trajectory whose next observation is not the next row's
+    bool has_next = false;
+};
+
+inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Trajectory>& trajectories) {
+    DataSetStatistics s;
+    size_t used = 0;
+    for (const Trajectory& trajectory : trajectories) {
+        double total = 0;
+        for (const float reward : trajectory.rewards) total += reward;
+        s.returns.add(total);
+        s.lengths.add(trajectory.length());
+        s.terminated += trajectory.terminated;
+        used += trajectory.rewards.size();
+    }
+    s.left_out = rows.count - used;
+    for (const float a : rows.actions) s.actions.add(a);
+    const size_t width = rows.state_dim;
+    for (size_t column = 0; column < width; ++column) {
+        bool dead = true;
+        for (size_t row = 1; dead && row < rows.count; ++row)
+            dead = rows.observations[row * width + column] == rows.observations[column];
+        s.dead_columns += dead;
+    }
+    s.has_next = !rows.next_observations.empty();
+    for (size_t row = 0; row + 1 < rows.count; ++row) {
+        const float *here = rows.observation(row), *next = rows.observation(row + 1);
+        s.repeated += std::equal(here, here + width, next);
+        const bool ends = rows.terminals[row] != 0 || (!rows.timeouts.empty() && rows.timeouts[row] != 0);
+        s.jumps += s.has_next && !ends && !std::equal(next, next + width, &rows.next_observations[row * width]);
+    }
+    return s;
+}
+
+inline std::string describe(const DataSetStatistics& s) {
+    char line[400];
+    std::snprintf(line, sizeof line, "trajectories: %.0f (%zu ended by the task), %zu rows in none\n", s.lengths.count,
+                  s.terminated, s.left_out);
+    std::string text = line;
+    text += "lengths:      " + s.lengths.text() + "\nreturns:      " + s.returns.text() + "\n";
+    std::snprintf(line, sizeof line,
+                  "actions:      %.9g to %.9g\nstate columns that never change: %zu\n"
+                  "rows that repeat the observation before: %zu\n",
+                  s.actions.low, s.actions.high, s.dead_columns, s.repeated);
+    text += line;
+    text += s.has_next ? "next observations that are not the next row's: " + std::to_string(s.jumps) + "\n"
+                       : "no next observations: the next row's stand in\n";
+    return text;
+}

@@ -1,0 +1,681 @@
+// sac.hpp: soft actor-critic (SAC), the learner whose policies made D4RL's locomotion data, for whoever makes such data
+// again: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905 (below: SAC), as rlkit
+// (github.com/rail-berkeley/rlkit, torch/sac) has it, whose defaults stand at Settings.
+//
+// In order: settings; replay; networks; the losses and the target; acting; the learner; files. The losses are
+// templates on the scalar, as all of nn.hpp: float trains, double checks them against finite differences.
+// The environment is any of the project's shape: spec(), reset(random, episode, state), step(action, state).
+// Promises: a run is a function of its settings (for one instruction set), no matter how many threads work on it and how
+// often it was stopped and resumed. Leaves out: discrete actions, normalised observations, several environments at once.
+//
+// Chance, by the streams of nn.hpp (a run of SAC has a seed of its own):
+//   initialisation  step: tensor, policy, critics in turn; index: element
+//   environment     step: episode, evaluations' as the caller numbers them
+//   exploration     step: episode; index: time-step; site: action dimension. At first a uniform, later a normal number
+//   batch           step: update; index: row of the batch
+//   entropy_noise   step: update; index: row; site: action dimension of a ~ pi(s), plus action_dim of a' ~ pi(s')
+#pragma once
+
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <initializer_list>
+#include <map>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "../gridworld.hpp"
+#include "../nn.hpp"
+#include "safetensors.hpp"
+
+namespace sac {
+
+// SAC's table 1, which are rlkit's defaults too (examples/sac.py), but for random_steps: rlkit lets the untrained policy
+// act for 1000 steps, then takes 1000 steps and 1000 updates in turn; here 10,000 uniformly random actions (as SAC's
+// authors' code for some tasks, and OpenAI's Spinning Up for all), then one update after each step: as many in all.
+struct Settings {
+    uint32_t seed = 0;
+    int hidden = 256;  // ReLU units in each of two layers
+    int batch = 256;
+    uint64_t capacity = 1000000;  // transitions; the oldest make room
+    uint64_t random_steps = 10000;
+    double learning_rate = 3e-4;  // Adam's, of policy, critics and temperature
+    double discount = 0.99;
+    double target_rate = 5e-3;
+    double reward_scale = 1;
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Replay.
+
+enum class End { none = 0, terminated = 1, cut = 2 };  // cut: by the time limit (or the engine); the task went on
+
+// A ring of rows: state [S], action [A], reward, End, next state [S]. A transition is one or two cache lines.
+struct Replay {
+    int state_dim, action_dim;
+    uint64_t capacity;
+    uint64_t next = 0;  // the row that is written next
+    std::vector<float> rows = {};
+
+    size_t width() const { return static_cast<size_t>(2 * state_dim + action_dim + 2); }
+    size_t size() const { return rows.size() / width(); }
+    const float* row(size_t i) const { return rows.data() + i * width(); }
+    const float* action(size_t i) const { return row(i) + state_dim; }
+    float reward(size_t i) const { return action(i)[action_dim]; }
+    End end(size_t i) const { return static_cast<End>(static_cast<int>(action(i)[action_dim + 1])); }
+    const float* next_state(size_t i) const { return action(i) + action_dim + 2; }
+    // The row written `back` rows before the next one, back >= 1.
+    size_t recent(uint64_t back) const { return (next + capacity - back) % capacity; }
+
+    void add(const float* state, const float* action, double reward, End end, const float* next_state) {
+        if (size() < capacity) rows.resize(rows.size() + width());
+        float* to = rows.data() + next * width();
+        to = std::copy_n(action, action_dim, std::copy_n(state, state_dim, to));
+        *to++ = static_cast<float>(reward);
+        *to++ = static_cast<float>(end);
+        std::copy_n(next_state, state_dim, to);
+        next = (next + 1) % capacity;
+    }
+    void cut_last() {
+        rows[recent(1) * width() + static_cast<size_t>(state_dim + action_dim + 1)] = static_cast<float>(End::cut);
+    }
+
+    template <class Archive>
+    void visit(Archive& archive) {
+        archive("replay.next", next);
+        archive("replay.rows", rows);
+        if (rows.size() % width() != 0 || size() > capacity || (size() < capacity ? next != size() : next >= capacity))
+            fail("checkpoint.shape", "the replay's rows do not fit its width, %zu", width());
+    }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Networks.
+
+template <class T>
+struct Network {
+    std::vector<Parameter<T>> parameters;  // weight [out, in] and bias [out] of fc0, fc1 and last_fc
+
+    // rlkit's start: hidden weights uniform in +-1 / sqrt(outputs) (its "fan in" reads the wrong side of the matrix),
+    // hidden biases 0.1, last layer uniform in +-last_range.
+    Network(int in, int hidden, int out, double last_range, uint32_t seed, uint64_t first_tensor) {
+        const Random random{seed, Stream::initialisation};
+        const auto add = [&](const char* name, const std::vector<int>& shape, double range) {
+            const size_t size = static_cast<size_t>(shape[0]) * static_cast<size_t>(shape.size() == 2 ? shape[1] : 1);
+            Parameter<T> p{name, {shape.begin(), shape.end()}, std::vector<T>(size, T(0.1)), std::vector<T>(size)};
+            for (uint32_t i = 0; range > 0 && i < size; ++i)
+                p.value[i] = static_cast<T>(range * (2 * random.uniform(first_tensor + parameters.size(), i) - 1));
+            parameters.push_back(std::move(p));
+        };
+        add("fc0.weight", {hidden, in}, 1 / std::sqrt(hidden));
+        add("fc0.bias", {hidden}, 0);
+        add("fc1.weight", {hidden, hidden}, 1 / std::sqrt(hidden));
+        add("fc1.bias", {hidden}, 0);
+        add("last_fc.weight", {out, hidden}, last_range);
+        add("last_fc.bias", {out}, last_range);
+    }
+    int inputs() const { return static_cast<int>(parameters[0].shape[1]); }
+    int hidden() const { return static_cast<int>(parameters[0].shape[0]); }
+    int outputs() const { return static_cast<int>(parameters[4].shape[0]); }
+};
+
+template <class T>
+using Pair = std::array<Network<T>, 2>;  // SAC sec. 6: two critics against overestimation
+
+// y [n, out] = x W^T + b, or max(that, 0): linear() and relu() of nn.hpp in fewer passes, and no packing for one row.
+template <class T>
+Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& bias, bool rectified) {
+    const int in = x.columns, out = weight.rows();
+    const Tensor<T> y = tape.make(x.rows, out), w = weight.tensor(), b = bias.tensor();
+    Compute& compute = tape.compute;
+    if (x.rows == 1)
+        for (ptrdiff_t j = 0; j < out; ++j) y.value[j] = dot(x.value, w.value + j * in, in);
+    else
+        matmul(compute, View<T>{y.value, out}, {x.value, in}, {w.value, in, true}, x.rows, out, in, Store::overwrite);
+    for (ptrdiff_t row = 0; row < y.rows; ++row)
+        for (ptrdiff_t j = 0; j < out; ++j) y.value[row * out + j] += b.value[j];
+    if (rectified)
+        for (size_t i = 0; i < y.size(); ++i) y.value[i] = y.value[i] < 0 ? T(0) : y.value[i];  // NaN stays
+    tape.on_backward([=, &compute] {
+        const View<const T> dy = {y.gradient, out}, dy_turned = {y.gradient, out, true};
+        if (rectified)
+            for (size_t i = 0; i < y.size(); ++i) y.gradient[i] = y.value[i] > 0 ? y.gradient[i] : T(0);
+        if (x.gradient)  // dx += dy W
+            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, Store::accumulate);
+        // dW += dy^T x
+        matmul(compute, View<T>{w.gradient, in}, dy_turned, {x.value, in}, out, in, x.rows, Store::accumulate);
+        add_column_sums(compute, b.gradient, y.gradient, y.rows, out);
+    });
+    return y;
+}
+
+template <class T>
+struct Layers {
+    Tensor<T> first, second, output;  // [n, hidden] after the ReLU, twice, and [n, out]
+};
+
+template <class T>
+Layers<T> forward(Tape<T>& tape, Network<T>& network, Tensor<T> x) {
+    std::vector<Parameter<T>>& p = network.parameters;
+    const Tensor<T> first = dense(tape, x, p[0], p[1], true), second = dense(tape, first, p[2], p[3], true);
+    return {first, second, dense(tape, second, p[4], p[5], false)};
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The losses.
+
+template <class T>
+struct Batch {
+    Tensor<T> states, pairs, next_states;  // [n, S], [n, S + A] states and actions side by side, [n, S]
+    Tensor<T> rewards, alive;              // [n, 1]; alive: 0 if the task ended there, else 1
+};
+
+template <class T>
+Tensor<T> input(Tape<T>& tape, int rows, int columns) {
+    const size_t size = static_cast<size_t>(rows) * static_cast<size_t>(columns);
+    return {tape.template scratch<T>(size), nullptr, rows, columns};
+}
+
+// The rows pick(0), ..., pick(n - 1) of the replay.
+template <class T, class Pick>
+Batch<T> gather(Tape<T>& tape, const Replay& replay, int n, Pick&& pick) {
+    const ptrdiff_t S = replay.state_dim, A = replay.action_dim;
+    const Batch<T> batch = {input(tape, n, replay.state_dim), input(tape, n, replay.state_dim + replay.action_dim),
+                            input(tape, n, replay.state_dim), input(tape, n, 1), input(tape, n, 1)};
+    for (ptrdiff_t i = 0; i < n; ++i) {
+        const size_t row = pick(static_cast<uint32_t>(i));
+        std::copy_n(replay.row(row), S, batch.states.value + i * S);
+        std::copy_n(replay.row(row), S + A, batch.pairs.value + i * (S + A));
+        std::copy_n(replay.next_state(row), S, batch.next_states.value + i * S);
+        batch.rewards.value[i] = static_cast<T>(replay.reward(row));
+        // A time limit is no part of the task: what follows it counts as if the episode went on.
+        batch.alive.value[i] = replay.end(row) == End::terminated ? T(0) : T(1);
+    }
+    return batch;
+}
+
+template <class T>
+struct Sample {
+    Tensor<T> action, log_prob;  // [n, A] in [-1, 1], [n, 1]
+};
+
+// SAC app. C: a = tanh(u), u = m + exp(l) noise, log pi(a) = log N(u; m, exp(l)) - sum log(1 - tanh(u)^2), of the
+// policy's output [n, 2A]: m, then l, which rlkit clamps to [-20, 2]. noise [n, A] standard normal.
+template <class T>
+Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
+    const ptrdiff_t A = output.columns / 2;
+    const Tensor<T> action = tape.make(output.rows, output.columns / 2), log_prob = tape.make(output.rows, 1);
+    const Tensor<T> normal = tape.constant(noise, action.rows, action.columns);
+    for (ptrdiff_t row = 0; row < output.rows; ++row) {
+        const T *mean = output.value + row * 2 * A, *l = mean + A, *z = normal.value + row * A;
+        log_prob.value[row] = 0;
+        for (ptrdiff_t j = 0; j < A; ++j) {
+            const T log_std = std::clamp(l[j], T(-20), T(2)), u = mean[j] + std::exp(log_std) * z[j];
+            action.value[row * A + j] = std::tanh(u);
+            log_prob.value[row] -= T(0.5) * z[j] * z[j] + log_std + T(half_log_2_pi) + log_tanh_slope(u);
+        }
+    }
+    tape.on_backward([=] {
+        for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
+            const ptrdiff_t mean = i / A * 2 * A + i % A, l = mean + A;
+            const T a = action.value[i], d_log_prob = log_prob.gradient[i / A], log_std = output.value[l];
+            const T du = (T(1) - a * a) * action.gradient[i] + T(2) * a * d_log_prob;
+            output.gradient[mean] += du;
+            if (log_std >= T(-20) && log_std <= T(2))
+                output.gradient[l] += du * std::exp(log_std) * normal.value[i] - d_log_prob;
+        }
+    });
+    return {action, log_prob};
+}
+
+// min_k Q_k(s, a), [n, 1]. Its gradient goes to the actions alone, and each row goes back through the critic that gave
+// the minimum alone: half the work, and none for the critics' parameters.
+template <class T>
+Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> actions) {
+    const int n = states.rows, S = states.columns, A = actions.columns, hidden = critics[0].hidden();
+    const Tensor<T> y = tape.make(n, 1), pairs = input(tape, n, S + A);
+    for (ptrdiff_t i = 0; i < n; ++i)
+        std::copy_n(actions.value + i * A, A, std::copy_n(states.value + i * S, S, pairs.value + i * (S + A)));
+    std::array<Layers<T>, 2> layers;
+    std::array<std::array<const T*, 3>, 2> weight;
+    const bool recording = std::exchange(tape.recording, false);
+    for (size_t k = 0; k < 2; ++k) {
+        layers[k] = forward(tape, critics[k], pairs);
+        for (size_t layer = 0; layer < 3; ++layer) weight[k][layer] = critics[k].parameters[2 * layer].value.data();
+    }
+    tape.recording = recording;
+    const Tensor<T> q0 = layers[0].output, q1 = layers[1].output;
+    for (ptrdiff_t i = 0; i < n; ++i) y.value[i] = q1.value[i] < q0.value[i] ? q1.value[i] : q0.value[i];
+    if (!recording) return y;
+    Compute& compute = tape.compute;
+    const Tensor<T> d_second = input(tape, n, hidden), d_first = input(tape, n, hidden), d_action = input(tape, n, A);
+    ptrdiff_t* rows = tape.template scratch<ptrdiff_t>(static_cast<size_t>(n));
+    tape.on_backward([=, &compute] {
+        for (size_t k = 0; k < 2; ++k) {
+            int m = 0;
+            for (ptrdiff_t i = 0; i < n; ++i)
+                if ((q1.value[i] < q0.value[i]) == (k == 1)) rows[m++] = i;
+            for (ptrdiff_t i = 0; i < m; ++i) {
+                const T *active = layers[k].second.value + rows[i] * hidden, *w = weight[k][2],
+                        dq = y.gradient[rows[i]];
+                T* to = d_second.value + i * hidden;
+                for (ptrdiff_t j = 0; j < hidden; ++j) to[j] = active[j] > 0 ? dq * w[j] : T(0);
+            }
+            matmul(compute, View<T>{d_first.value, hidden}, {d_second.value, hidden}, {weight[k][1], hidden}, m, hidden,
+                   hidden, Store::overwrite);
+            for (ptrdiff_t i = 0; i < m; ++i) {
+                const T* active = layers[k].first.value + rows[i] * hidden;
+                T* to = d_first.value + i * hidden;
+                for (ptrdiff_t j = 0; j < hidden; ++j) to[j] = active[j] > 0 ? to[j] : T(0);
+            }
+            matmul(compute, View<T>{d_action.value, A}, {d_first.value, hidden}, {weight[k][0] + S, S + A}, m, A,
+                   hidden, Store::overwrite);
+            for (ptrdiff_t i = 0; i < m; ++i)
+                for (ptrdiff_t j = 0; j < A; ++j) actions.gradient[rows[i] * A + j] += d_action.value[i * A + j];
+        }
+    });
+    return y;
+}
+
+// SAC eq. (5) and (3): y [n] = scale r + gamma (1 - terminated) (min_k Qbar_k(s', a') - alpha log pi(a' | s')),
+// a' ~ pi(s') by `noise` [n, A]. No gradient; valid until the tape is reset.
+template <class T>
+const float* q_target(Tape<T>& tape, Network<T>& policy, Pair<T>& targets, const Batch<T>& batch, const float* noise,
+                      T alpha, const Settings& settings) {
+    const bool recording = std::exchange(tape.recording, false);
+    const Sample<T> sample = draw(tape, forward(tape, policy, batch.next_states).output, noise);
+    const Tensor<T> q = least_q(tape, targets, batch.next_states, sample.action);
+    tape.recording = recording;
+    float* y = tape.template scratch<float>(q.size());
+    const T scale = static_cast<T>(settings.reward_scale), discount = static_cast<T>(settings.discount);
+    for (size_t i = 0; i < q.size(); ++i)
+        y[i] = static_cast<float>(scale * batch.rewards.value[i] +
+                                  discount * batch.alive.value[i] * (q.value[i] - alpha * sample.log_prob.value[i]));
+    return y;
+}
+
+// Of x [n, 1]: [1, 1].
+template <class T>
+Tensor<T> mean(Tape<T>& tape, Tensor<T> x) {
+    const std::vector<float> shares(x.size(), 1.0f / static_cast<float>(x.rows));
+    return weighted_sum(tape, x, shares.data());
+}
+
+// SAC eq. (5) without its 1/2, as rlkit: J_Q = sum_k mean (Q_k(s, a) - y)^2, [1, 1]. target [n].
+template <class T>
+Tensor<T> critic_loss(Tape<T>& tape, Pair<T>& critics, const Batch<T>& batch, const float* target) {
+    const Tensor<T> q0 = forward(tape, critics[0], batch.pairs).output,
+                    q1 = forward(tape, critics[1], batch.pairs).output;
+    return combine(tape, T(1), mean(tape, squared_error(tape, q0, target)), T(1),
+                   mean(tape, squared_error(tape, q1, target)));
+}
+
+// SAC eq. (9): J_pi = mean (alpha log pi(a | s) - min_k Q_k(s, a)), a = `sample` of the policy at s, [1, 1].
+template <class T>
+Tensor<T> policy_loss(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Sample<T> sample, T alpha) {
+    const Tensor<T> q = least_q(tape, critics, states, sample.action);
+    return combine(tape, alpha, mean(tape, sample.log_prob), T(-1), mean(tape, q));
+}
+
+// SAC eq. (18), with log alpha for alpha, as rlkit: J(alpha) = mean (-log alpha (log pi(a | s) + target_entropy)).
+// Returns it, and adds its gradient to log alpha's; the policy has no part in it.
+template <class T>
+T temperature_loss(Parameter<T>& log_alpha, Tensor<T> log_prob, T target_entropy) {
+    T slope = 0;
+    for (ptrdiff_t i = 0; i < log_prob.rows; ++i) slope -= (log_prob.value[i] + target_entropy) / T(log_prob.rows);
+    log_alpha.gradient[0] += slope;
+    return slope * log_alpha.value[0];
+}
+
+// SAC algorithm 1: target = (1 - rate) target + rate value.
+EACH_TARGET inline void soft_update(float* __restrict target, const float* __restrict value, size_t n, float rate) {
+    for (size_t i = 0; i < n; ++i) target[i] = (1 - rate) * target[i] + rate * value[i];
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Acting.
+
+// An action of the policy at one state and its log-probability (D4RL's infos/action_log_probs). noise [A]: standard
+// normal, or zeros for the mean action. The tape is emptied, and records no more.
+inline float act(Tape<float>& tape, Network<float>& policy, const float* state, const float* noise, float* action) {
+    tape.reset();
+    tape.recording = false;
+    const Sample<float> sample =
+        draw(tape, forward(tape, policy, tape.constant(state, 1, policy.inputs())).output, noise);
+    std::copy_n(sample.action.value, sample.action.size(), action);
+    return sample.log_prob.value[0];
+}
+
+struct Episode {
+    std::vector<float> states, actions, rewards, log_probs;  // [n, S], [n, A], [n], [n]
+    std::vector<float> last_state;                           // [S] after the last step
+    bool terminated = false;
+    bool spoiled = false;  // by the engine: to be dropped
+    double total = 0;      // undiscounted
+};
+
+// One episode up to termination or the time limit; before_step() is called with the environment still at states[t].
+template <class Environment, class BeforeStep>
+Episode play(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed, uint64_t number,
+             bool sampled, BeforeStep&& before_step) {
+    const EnvironmentSpec spec = environment.spec();
+    const Random random{seed, Stream::exploration};
+    Episode episode;
+    std::vector<float> state(static_cast<size_t>(spec.state_dim)), action(static_cast<size_t>(spec.action_dim));
+    std::vector<float> noise(action.size());
+    environment.reset(Random{seed, Stream::environment}, number, state.data());
+    try {
+        for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps) && !episode.terminated; ++t) {
+            for (uint32_t i = 0; sampled && i < noise.size(); ++i) noise[i] = random.normal(number, t, i);
+            episode.log_probs.push_back(act(tape, policy, state.data(), noise.data(), action.data()));
+            episode.states.insert(episode.states.end(), state.begin(), state.end());
+            episode.actions.insert(episode.actions.end(), action.begin(), action.end());
+            before_step();
+            const Step step = environment.step(action.data(), state.data());
+            episode.rewards.push_back(static_cast<float>(step.reward));
+            episode.total += step.reward;
+            episode.terminated = step.terminated;
+        }
+    } catch (const Error& error) {
+        if (error.id != "mujoco.unstable") throw;
+        episode.spoiled = true;
+    }
+    episode.last_state = state;
+    return episode;
+}
+
+// Mean return of `count` episodes, numbered from first_episode, but for those that the engine spoils.
+template <class Environment>
+double evaluate(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed,
+                uint64_t first_episode, int count, bool sampled) {
+    double total = 0, sound = 0;
+    for (uint64_t i = 0; i < static_cast<uint64_t>(count); ++i) {
+        const Episode episode = play(tape, policy, environment, seed, first_episode + i, sampled, [] {});
+        if (episode.spoiled) continue;
+        total += episode.total;
+        sound += 1;
+    }
+    return total / sound;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The learner.
+
+struct Progress {
+    uint64_t steps = 0, updates = 0, episodes = 0;  // steps of the environment; finished episodes
+    uint64_t episode_steps = 0;
+    double episode_return = 0, last_return = NAN;  // of the present episode so far, of the last finished one
+};
+
+struct Losses {                                                     // of an update
+    double critic = NAN, policy = NAN, alpha = NAN, entropy = NAN;  // entropy: mean -log pi(a | s)
+};
+
+struct Learner {
+    Settings settings;
+    EnvironmentSpec spec;
+    Tape<float> learning, acting;
+    std::vector<float> action, noise, next_state;  // scratch
+    Losses last;                                   // for whoever watches
+
+    // The state of the run, all of it in visit(), but for the environment's, which resume() makes again.
+    Progress progress;
+    std::vector<float> state;  // [S] the present one
+    Network<float> policy;     // outputs: means, then log standard deviations
+    Pair<float> critics, targets;
+    std::vector<Parameter<float>> log_alpha;  // one; alpha starts at 1
+    Optimizer policy_optimizer, alpha_optimizer;
+    std::array<Optimizer, 2> critic_optimizers;
+    Replay replay;
+
+    Learner(const Settings& s, const EnvironmentSpec& e, Compute& compute)
+        : settings(s),
+          spec(e),
+          learning(compute),
+          acting(compute),
+          action(static_cast<size_t>(e.action_dim)),
+          noise(2 * static_cast<size_t>(s.batch) * action.size()),
+          next_state(static_cast<size_t>(e.state_dim)),
+          state(next_state),
+          policy(e.state_dim, s.hidden, 2 * e.action_dim, 1e-3, s.seed, 0),
+          critics{Network<float>(e.state_dim + e.action_dim, s.hidden, 1, 3e-3, s.seed, 6),
+                  Network<float>(e.state_dim + e.action_dim, s.hidden, 1, 3e-3, s.seed, 12)},
+          targets(critics),
+          log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}},
+          replay{e.state_dim, e.action_dim, s.capacity} {
+        if (e.moves != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1)
+            fail("sac.settings", "SAC needs continuous actions, a batch and a replay of at least one episode (%d)",
+                 e.max_episode_steps);
+        replay.rows.reserve(s.capacity * replay.width());  // untouched until it is needed
+    }
+
+    // One step of the environment, and after the first random ones an update.
+    template <class Environment>
+    void step(Environment& environment) {
+        Progress& p = progress;
+        if (p.episode_steps == 0)
+            environment.reset(Random{settings.seed, Stream::environment}, p.episodes, state.data());
+        choose_action();
+        ++p.steps;
+        bool over = false;
+        try {
+            const Step result = environment.step(action.data(), next_state.data());
+            ++p.episode_steps;
+            p.episode_return += result.reward;
+            over = result.terminated || p.episode_steps >= static_cast<uint64_t>(spec.max_episode_steps);
+            const End end = result.terminated ? End::terminated : over ? End::cut : End::none;
+            replay.add(state.data(), action.data(), result.reward, end, next_state.data());
+            state = next_state;
+        } catch (const Error& error) {
+            if (error.id != "mujoco.unstable") throw;
+            if (p.episode_steps > 0) replay.cut_last();
+            over = true;
+        }
+        if (over) {
+            p.last_return = p.episode_return;
+            p.episode_return = 0;
+            p.episode_steps = 0;
+            ++p.episodes;
+        }
+        if (p.steps > settings.random_steps && replay.size() > 0) update();
+    }
+
+    void choose_action() {
+        const Random random{settings.seed, Stream::exploration};
+        const uint32_t t = static_cast<uint32_t>(progress.episode_steps);
+        if (progress.steps < settings.random_steps) {
+            for (uint32_t i = 0; i < action.size(); ++i)
+                action[i] = static_cast<float>(2 * random.uniform(progress.episodes, t, i) - 1);
+            return;
+        }
+        for (uint32_t i = 0; i < action.size(); ++i) noise[i] = random.normal(progress.episodes, t, i);
+        act(acting, policy, state.data(), noise.data(), action.data());
+    }
+
+    // SAC algorithm 1, in rlkit's order: first the temperature, then all networks from the same old ones.
+    void update() {
+        const Random rows{settings.seed, Stream::batch}, normals{settings.seed, Stream::entropy_noise};
+        const uint64_t number = progress.updates++;
+        const size_t A = action.size(), n = static_cast<size_t>(settings.batch);
+        for (size_t i = 0; i < 2 * n * A; ++i)
+            noise[i] = normals.normal(number, static_cast<uint32_t>(i / A % n),
+                                      static_cast<uint32_t>(i % A + (i < n * A ? 0 : A)));
+        learning.reset();
+        Tape<float>& tape = learning;
+        const Batch<float> batch =
+            gather(tape, replay, settings.batch, [&](uint32_t i) { return rows.below(replay.size(), number, i); });
+        const Sample<float> sample = draw(tape, forward(tape, policy, batch.states).output, noise.data());
+        temperature_loss(log_alpha[0], sample.log_prob, -static_cast<float>(spec.action_dim));
+        adam(log_alpha, alpha_optimizer);
+        const float alpha = std::exp(log_alpha[0].value[0]);
+        const float* target = q_target(tape, policy, targets, batch, noise.data() + n * A, alpha, settings);
+        const Tensor<float> critic = critic_loss(tape, critics, batch, target),
+                            actor = policy_loss(tape, critics, batch.states, sample, alpha);
+        tape.backward(combine(tape, 1.0f, critic, 1.0f, actor));  // they share no parameter
+        adam(policy.parameters, policy_optimizer);
+        for (size_t k = 0; k < 2; ++k) {
+            adam(critics[k].parameters, critic_optimizers[k]);
+            for (size_t i = 0; i < critics[k].parameters.size(); ++i) {
+                const std::vector<float>& value = critics[k].parameters[i].value;
+                soft_update(targets[k].parameters[i].value.data(), value.data(), value.size(),
+                            static_cast<float>(settings.target_rate));
+            }
+        }
+        double log_prob = 0;
+        for (size_t i = 0; i < n; ++i) log_prob += static_cast<double>(sample.log_prob.value[i]);
+        last = {static_cast<double>(critic.value[0]), static_cast<double>(actor.value[0]), static_cast<double>(alpha),
+                -log_prob / static_cast<double>(n)};
+    }
+
+    void adam(std::vector<Parameter<float>>& parameters, Optimizer& optimizer) {
+        OptimizerConfig config;
+        config.rule = OptimizerConfig::Rule::adamw;  // without decay: Adam
+        config.learning_rate = settings.learning_rate;
+        config.clip_norm = 0;
+        config.warmup_updates = 0;
+        update_parameters(learning.compute, parameters, optimizer, config);
+    }
+
+    // Brings a fresh environment to where the loaded run stands: the present episode once more, from the replay.
+    template <class Environment>
+    void resume(Environment& environment) {
+        std::vector<float> found = state;
+        if (progress.episode_steps > 0)
+            environment.reset(Random{settings.seed, Stream::environment}, progress.episodes, found.data());
+        for (uint64_t back = progress.episode_steps; back > 0; --back)
+            environment.step(replay.action(replay.recent(back)), found.data());
+        if (found != state)
+            fail("sac.resume", "the present episode (%llu) went another way; resume on the machine that began it",
+                 static_cast<unsigned long long>(progress.episodes));
+    }
+
+    template <class Archive>
+    void visit(Archive& archive) {
+        const auto trained = [&](const std::string& name, std::vector<Parameter<float>>& parameters,
+                                 Optimizer& moments) {
+            archive(name + ".updates", moments.updates);
+            moments.first_moment.resize(parameters.size());
+            moments.second_moment.resize(parameters.size());
+            for (size_t i = 0; i < parameters.size(); ++i)
+                for (auto [part, values] : std::initializer_list<std::pair<const char*, std::vector<float>&>>{
+                         {".value.", parameters[i].value},
+                         {".first_moment.", moments.first_moment[i]},
+                         {".second_moment.", moments.second_moment[i]}}) {
+                    values.resize(parameters[i].value.size());  // moments that no update has touched yet are zeros
+                    archive(name + part + parameters[i].name, values);
+                }
+        };
+        archive("progress.steps", progress.steps);
+        archive("progress.updates", progress.updates);
+        archive("progress.episodes", progress.episodes);
+        archive("progress.episode_steps", progress.episode_steps);
+        archive("progress.episode_return", progress.episode_return);
+        archive("progress.last_return", progress.last_return);
+        archive("state", state);
+        trained("policy", policy.parameters, policy_optimizer);
+        trained("temperature", log_alpha, alpha_optimizer);
+        for (size_t k = 0; k < 2; ++k) {
+            const std::string number = std::to_string(k);
+            trained("critic" + number, critics[k].parameters, critic_optimizers[k]);
+            for (Parameter<float>& parameter : targets[k].parameters)
+                archive("target" + number + "." + parameter.name, parameter.value);
+        }
+        replay.visit(archive);
+        if (progress.episode_steps > replay.size())
+            fail("checkpoint.shape", "an episode of %llu steps is not in the replay",
+                 static_cast<unsigned long long>(progress.episode_steps));
+    }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Files: a checkpoint is the whole state; a policy has the names and shapes of D4RL's metadata/policy.
+
+// What must agree between a checkpoint and the run that loads it.
+inline std::string settings_text(const Learner& learner) {
+    const Settings& s = learner.settings;
+    char text[400];
+    std::snprintf(text, sizeof text,
+                  "seed=%u hidden=%d batch=%d capacity=%llu random_steps=%llu learning_rate=%.17g discount=%.17g "
+                  "target_rate=%.17g reward_scale=%.17g state_dim=%d action_dim=%d max_episode_steps=%d kernel=%s",
+                  s.seed, s.hidden, s.batch, static_cast<unsigned long long>(s.capacity),
+                  static_cast<unsigned long long>(s.random_steps), s.learning_rate, s.discount, s.target_rate,
+                  s.reward_scale, learner.spec.state_dim, learner.spec.action_dim, learner.spec.max_episode_steps,
+                  learner.learning.compute.kernel.fused ? "fused" : "plain");
+    return text;
+}
+
+// `note`: what the caller wants to know of the run besides (the task, say); it must be the same when it is loaded.
+inline void save_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
+    TensorFile file;
+    file.metadata["format"] = "wodtem sac checkpoint 1";
+    file.metadata["settings"] = settings_text(learner) + " " + note;
+    file.buffer.reserve(learner.replay.rows.size() * sizeof(float) + (16 << 20));
+    Saver saver{file};
+    learner.visit(saver);
+    write_safetensors(path, file);
+}
+
+// After this, resume(). Errors: sac.checkpoint, checkpoint.shape, file.*, safetensors.*; the learner is of no use then.
+inline void load_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
+    const TensorFile file = read_safetensors(path);
+    if (file.text("format") != "wodtem sac checkpoint 1")
+        fail("sac.checkpoint", "%s: is no checkpoint of a SAC run", path.c_str());
+    const std::string wanted = settings_text(learner) + " " + note;
+    if (file.text("settings") != wanted)
+        fail("sac.checkpoint", "%s: was made with %s, this run has %s", path.c_str(), file.text("settings").c_str(),
+             wanted.c_str());
+    Loader loader{file};
+    learner.visit(loader);
+}
+
+struct SavedPolicy {
+    Network<float> network;
+    std::map<std::string, std::string> metadata;  // task, physics, return, steps, ...
+};
+
+// Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256], which gives the means, and
+// last_fc_log_std.*: D4RL's names and PyTorch's layout. `parameters` may be const.
+template <class Parameters, class F>
+void each_policy_tensor(Parameters& parameters, F&& f) {
+    for (size_t i = 0; i < 4; ++i) f(parameters[i].name, parameters[i].shape, std::span(parameters[i].value));
+    for (size_t half = 0; half < 2; ++half)
+        for (size_t i = 4; i < 6; ++i) {
+            Shape shape = parameters[i].shape;
+            shape[0] /= 2;
+            const size_t size = parameters[i].value.size() / 2;
+            f((half == 0 ? "last_fc" : "last_fc_log_std") + parameters[i].name.substr(7), shape,
+              std::span(parameters[i].value).subspan(half * size, size));
+        }
+}
+
+inline void save_policy(const std::string& path, const SavedPolicy& policy) {
+    TensorFile file;
+    file.metadata = policy.metadata;
+    file.metadata["nonlinearity"] = "relu";
+    file.metadata["output_distribution"] = "tanh_gaussian";
+    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+        file.add(name, shape, values);
+    });
+    write_safetensors(path, file);
+}
+
+// Errors: sac.policy, file.*, safetensors.*
+inline SavedPolicy policy_of(const TensorFile& file) {
+    const Shape first = file.find("fc0.weight").shape, last = file.find("last_fc.weight").shape;
+    const auto too_large = [](uint64_t extent) { return extent < 1 || extent > 1 << 14; };
+    if (first.size() != 2 || last.size() != 2 || too_large(first[0]) || too_large(first[1]) || too_large(last[0]))
+        fail("sac.policy", "%s: fc0.weight %s and last_fc.weight %s are not those of a policy", file.path.c_str(),
+             shape_text(first).c_str(), shape_text(last).c_str());
+    const int hidden = static_cast<int>(first[0]);
+    SavedPolicy policy = {{static_cast<int>(first[1]), hidden, static_cast<int>(2 * last[0]), 1, 0, 0}, file.metadata};
+    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+        file.read_into(values, name, shape);
+    });
+    return policy;
+}
+
+inline SavedPolicy load_policy(const std::string& path) { return policy_of(read_safetensors(path)); }
+
+}  // namespace sac

@@ -1,0 +1,113 @@
+// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; and the search for a file.
+#include <unistd.h>
+
+#include "../data/d4rl.hpp"
+#include "test.hpp"
+
+namespace {
+
+// Rows of one state number and one action number each; rewards count rows.
+Rows made(const std::vector<float>& states, const std::vector<uint8_t>& terminals,
+          const std::vector<uint8_t>& timeouts) {
+    Rows rows;
+    rows.count = states.size();
+    rows.state_dim = rows.action_dim = 1;
+    rows.observations = states;
+    for (size_t i = 0; i < states.size(); ++i) {
+        rows.actions.push_back(states[i] / 100);
+        rows.rewards.push_back(static_cast<float>(i));
+    }
+    rows.terminals = terminals;
+    rows.timeouts = timeouts;
+    return rows;
+}
+
+// "0 1 2! | 3": the rewards, which are row numbers; ! where the task ended the trajectory.
+std::string shown(const std::vector<Trajectory>& trajectories) {
+    std::string text;
+    for (const Trajectory& trajectory : trajectories) {
+        text += text.empty() ? "" : " | ";
+        for (const float reward : trajectory.rewards)
+            text += (text.empty() || text.back() == ' ' ? "" : " ") + std::to_string(static_cast<int>(reward));
+        text += trajectory.terminated ? "!" : "";
+        CHECK_EQUAL(trajectory.states.size(), trajectory.rewards.size());
+        for (size_t i = 0; i < trajectory.states.size(); ++i)
+            CHECK_EQUAL(trajectory.actions[i], trajectory.states[i] / 100);
+    }
+    return text;
+}
+
+}  // namespace
+
+TEST(trajectories_end_at_terminals_and_timeouts_and_a_tail_without_a_flag_is_none) {
+    const Rows rows = made({5, 6, 7, 8, 9, 1, 2, 3}, {0, 0, 1, 0, 0, 0, 0, 0}, {0, 0, 0, 0, 0, 1, 0, 0});
+    CHECK_EQUAL(shown(cut_at_flags(rows, 1000)), "0 1 2! | 3 4 5");
+    const DataSetStatistics s = statistics_of(rows, cut_at_flags(rows, 1000));
+    CHECK_EQUAL(s.left_out, size_t{2});
+    CHECK_EQUAL(s.terminated, size_t{1});
+    CHECK_CLOSE(s.returns.mean(), (0 + 1 + 2 + 3 + 4 + 5) / 2.0, 1e-12);
+    CHECK_CLOSE(s.returns.deviation(), 4.5, 1e-12);  // of 3 and 12
+    CHECK_CLOSE(s.lengths.mean(), 3, 1e-12);
+}
+
+TEST(a_step_with_only_a_timeout_is_no_termination_and_one_with_both_is) {
+    CHECK_EQUAL(shown(cut_at_flags(made({1, 2, 3, 4}, {0, 0, 0, 1}, {0, 1, 0, 1}), 1000)), "0 1 | 2 3!");
+}
+
+TEST(without_timeouts_the_time_limit_ends_a_trajectory_too) {
+    CHECK_EQUAL(shown(cut_at_flags(made({1, 2, 3, 4, 5, 6, 7, 8}, {0, 1, 0, 0, 0, 0, 0, 0}, {}), 3)),
+                "0 1! | 2 3 4 | 5 6 7");
+}
+
+// Rows 2 and 6 (timeouts) and 7 (the last) are no tuples; 1 does not lead to 3, 4 ends by itself, 5 is the last tuple.
+TEST(antmaze_is_cut_where_tuples_do_not_go_on_and_at_every_terminal) {
+    CHECK_EQUAL(
+        shown(cut_tuples(made({0, 1, 2, 10, 11, 12, 13, 20}, {0, 0, 0, 0, 1, 0, 0, 0}, {0, 0, 1, 0, 0, 0, 1, 0}))),
+        "0 1 | 3 4! | 5");
+    // Success goes on: each row at the goal is a trajectory of its own, as in ODT.
+    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 3, 4, 5}, {0, 0, 1, 1, 1, 0}, {0, 0, 0, 0, 0, 0}))),
+                "0 1 2! | 3! | 4!");
+    // A timeout whose next episode starts where its next row stood joins them: only states tell.
+    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 2, 3, 4}, {0, 0, 0, 0, 0, 0}, {0, 0, 1, 0, 0, 0}))), "0 1 3 4");
+    CHECK_EQUAL(shown(cut_tuples(made({0}, {0}, {0}))), "");
+}
+
+TEST(statistics_count_dead_columns_repetitions_and_jumps) {
+    Rows rows = made({4, 4, 5, 6}, {0, 0, 0, 1}, {});
+    rows.state_dim = 2;
+    rows.observations = {4, 0, 4, 0, 5, 0, 6, 0};
+    rows.next_observations = {4, 0, 5, 0, 9, 0, 7, 0};
+    const DataSetStatistics s = statistics_of(rows, cut_at_flags(rows, 1000));
+    CHECK_EQUAL(s.dead_columns, size_t{1});
+    CHECK_EQUAL(s.repeated, size_t{1});
+    CHECK_EQUAL(s.jumps, size_t{1});
+    CHECK_CLOSE(s.actions.low, 0.04, 1e-7);
+}
+
+TEST(rows_of_another_size_or_without_an_end_are_refused) {
+    const MujocoTask& hopper = *find_mujoco_task("hopper");
+    CHECK_FAILS("dataset.task", cut_trajectories(made({1, 2}, {0, 1}, {}), hopper, "f"));
+    MujocoTask tiny = hopper;
+    tiny.state_dim = tiny.action_dim = 1;
+    CHECK_FAILS("dataset.empty", cut_trajectories(made({1, 2}, {0, 0}, {}), tiny, "f"));
+    CHECK_EQUAL(cut_trajectories(made({1, 2}, {0, 1}, {}), tiny, "f").size(), size_t{1});
+}
+
+TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
+    char name[] = "/tmp/wodtem-test-XXXXXX";
+    const std::string folder = mkdtemp(name);
+    const char* const before = std::getenv("D4RL_DATASET_DIR");
+    const std::string kept = before ? before : "";
+    setenv("D4RL_DATASET_DIR", folder.c_str(), 1);
+    const PublishedDataSet& set = *find_published("maze2d-large-v1");
+    CHECK_EQUAL(file_name(set), "maze2d-large-sparse-v1.hdf5");
+    if (!std::filesystem::exists(std::string(own_folder) + "/" + file_name(set))) {
+        CHECK_FAILS("dataset.missing", find_data_set(set));
+    }
+    write_file_atomic(folder + "/maze2d-large-sparse-v1.hdf5", "x");
+    CHECK_EQUAL(find_data_set(set), folder + "/maze2d-large-sparse-v1.hdf5");
+    before ? setenv("D4RL_DATASET_DIR", kept.c_str(), 1) : unsetenv("D4RL_DATASET_DIR");
+    std::filesystem::remove_all(folder);
+    CHECK(find_published("maze2d-huge-v1") == nullptr);
+    for (const PublishedDataSet& one : published_data_sets) CHECK(find_mujoco_task(one.id) != nullptr);
+}

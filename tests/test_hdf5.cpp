@@ -1,0 +1,513 @@
+// test_hdf5.cpp: data/hdf5.hpp against files that h5py made (tests/hdf5/make.py), published checksums, streams made by
+// zlib, files of its own, and damage of every kind.
+#include <sys/resource.h>
+#include <sys/wait.h>
+
+#include <csignal>
+#include <filesystem>
+
+#include "../data/hdf5.hpp"
+#include "test.hpp"
+
+namespace {
+
+struct Folder {
+    std::filesystem::path path = std::filesystem::temp_directory_path() / ("wodtem_hdf5_" + std::to_string(::getpid()));
+    Folder() { std::filesystem::create_directories(path); }
+    ~Folder() { std::filesystem::remove_all(path); }
+    std::string operator/(const std::string& name) const { return (path / name).string(); }
+};
+
+// tests/hdf5/NAME.z: the size, then a zlib stream.
+std::string fixture(const std::string& name) {
+    const std::string packed = read_file("tests/hdf5/" + name + ".z");
+    std::vector<uint8_t> bytes(little_endian(as_bytes(packed).first(8)));
+    const char* wrong = inflate_zlib(as_bytes(packed).subspan(8), bytes);
+    if (wrong != nullptr) fail("test.fixture", "%s: %s", name.c_str(), wrong);
+    return std::string(bytes.begin(), bytes.end());
+}
+
+Hdf5File parse(const std::string& bytes) {
+    const auto kept = std::make_shared<const std::string>(bytes);
+    return parse_hdf5(as_bytes(*kept), kept, "test");
+}
+
+// What make.py stores as element i.
+double formula(const std::string& type, size_t i) {
+    const double v = static_cast<double>(37 * i % 251);
+    if (type.starts_with("float")) return v / 128;
+    if (type.starts_with("bool")) return 37 * i % 251 % 2 == 1 ? 1 : 0;
+    return type.starts_with("int") ? v - 125 : v;
+}
+
+double stored(const std::string& path, const std::string& type, size_t i) {
+    if (path == "types/scalar") return -125.0 / 128;
+    if (path == "types/enumeration") return i == 0 ? 7 : i == 1 ? 0 : 1;
+    if (path == "chunks/holes") return i / 6 / 2 == 1 && i % 6 / 2 == 1 ? 7 : -2.5;
+    if (path == "chunks/holes_gzip") return i == 4 ? 1 : 9;
+    if (path == "chunks/nothing") return 0;
+    if (path == "chunks/unwritten") return 0.5;
+    if (path == "chunks/grown" && i >= 20) return 0;
+    if (path == "sparse_pages") return i == 0 || i == 4096 || i == 5119 || i == 8999 ? 200 : 3;
+    if (path == "sparse_rows") {
+        constexpr size_t set[] = {0, 131059, 131060, 132083, 132084, 133108, 135000, 139999};
+        return std::ranges::find(set, i) != std::end(set) ? 200 : 3;
+    }
+    return formula(type, i);
+}
+
+void check_contents(const std::string& name, const Hdf5File& file, size_t expected_count) {
+    CHECK_EQUAL(file.datasets.size(), expected_count);
+    for (const Hdf5Dataset& dataset : file.datasets) {
+        if (!dataset.unsupported.empty() || dataset.element.kind == Hdf5Element::text) continue;
+        const std::vector<double> values = file.read_doubles(dataset);
+        const std::vector<float> floats = file.read_floats(dataset);
+        size_t wrong = values.size() == dataset.elements && floats.size() == dataset.elements ? 0 : 1;
+        for (size_t i = 0; i < values.size(); ++i) {
+            const double expected = stored(dataset.path, dataset.type, i);
+            wrong += values[i] == expected && floats[i] == static_cast<float>(expected) ? 0 : 1;
+        }
+        if (wrong > 0) report_failure(__FILE__, __LINE__, name + ": " + dataset.path + ": wrong values");
+    }
+}
+
+// Reads all there is; an Error is as good an end as a value.
+bool survives(const std::string& bytes) {
+    try {
+        const Hdf5File file = parse(bytes);
+        for (const Hdf5Dataset& dataset : file.datasets) {
+            try {
+                if (dataset.element.kind == Hdf5Element::text)
+                    file.read_text(dataset);
+                else if (file.read_floats(dataset).size() != dataset.elements)
+                    return false;
+            } catch (const Error& error) {
+                if (!error.id.starts_with("hdf5.")) return false;
+            }
+        }
+        return true;
+    } catch (const Error& error) {
+        return error.id.starts_with("hdf5.");
+    }
+}
+
+uint64_t u64(const std::string& bytes, size_t at) { return little_endian(as_bytes(bytes).subspan(at, 8)); }
+void set_u64(std::string& bytes, size_t at, uint64_t value) { std::memcpy(bytes.data() + at, &value, 8); }
+
+// Where a structure [begin, end) is followed by its checksum: at each signature every length is tried.
+std::vector<std::pair<size_t, size_t>> checksummed(const std::string& bytes) {
+    std::vector<std::pair<size_t, size_t>> found;
+    constexpr const char* signatures[] = {"\x89HDF", "OHDR", "OCHK", "BTHD", "BTLF", "BTIN", "FRHP",
+                                          "FHIB",    "FAHD", "FADB", "EAHD", "EAIB", "EADB", "EASB"};
+    for (const char* signature : signatures)
+        for (size_t at = bytes.find(signature); at != std::string::npos; at = bytes.find(signature, at + 1))
+            for (size_t end = at + 8; end + 4 <= bytes.size() && end < at + 700; ++end)
+                if (lookup3(as_bytes(bytes).subspan(at, end - at)) == little_endian(as_bytes(bytes).subspan(end, 4))) {
+                    found.emplace_back(at, end);
+                    break;
+                }
+    return found;
+}
+
+void seal(std::string& bytes, const std::vector<std::pair<size_t, size_t>>& structures) {
+    for (const auto& [begin, end] : structures) {
+        const uint32_t sum = lookup3(as_bytes(bytes).subspan(begin, end - begin));
+        std::memcpy(bytes.data() + end, &sum, 4);
+    }
+}
+
+std::string unhex(const std::string& digits) {
+    std::string bytes;
+    for (size_t i = 0; i < digits.size(); i += 2)
+        bytes += static_cast<char>(std::stoi(digits.substr(i, 2), nullptr, 16));
+    return bytes;
+}
+
+const char* inflates_to(const std::string& stream, const std::string& expected) {
+    std::string out(expected.size(), '?');
+    const char* wrong = inflate_zlib(as_bytes(stream), std::span(reinterpret_cast<uint8_t*>(out.data()), out.size()));
+    return wrong != nullptr ? wrong : out == expected ? nullptr : "other bytes";
+}
+
+}  // namespace
+
+TEST(sha256_gives_the_digests_of_the_standard) {  // FIPS 180-2, appendix B, and the empty message
+    CHECK_EQUAL(sha256(as_bytes("")), "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855");
+    CHECK_EQUAL(sha256(as_bytes("abc")), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+    CHECK_EQUAL(sha256(as_bytes("abcdbcdecdefdefgefghfghighijhijkijkljklmklmnlmnomnopnopq")),
+                "248d6a61d20638b8e5c026930c3e6039a33ce45964ff2167f6ecedd419db06c1");
+    CHECK_EQUAL(sha256(as_bytes(std::string(1000000, 'a'))),
+                "cdc76e5c9914fb9281a1c7e284d73e67f1809a48a497200e046d39ccc7112cd0");
+    const Folder folder;
+    write_file_atomic(folder / "f", "abc");
+    CHECK_EQUAL(sha256_of_file(folder / "f"), sha256(as_bytes("abc")));
+    write_file_atomic(folder / "f", "");
+    CHECK_EQUAL(sha256_of_file(folder / "f"), sha256(as_bytes("")));
+    CHECK_FAILS("file.open", sha256_of_file(folder / "missing"));
+}
+
+TEST(hdf5_checksums_give_published_values) {
+    CHECK_EQUAL(adler32(as_bytes("Wikipedia")), 0x11E60398u);
+    CHECK_EQUAL(adler32(as_bytes(std::string(1000000, '\xFF'))), 0x3843E1BEu);  // zlib.adler32
+    CHECK_EQUAL(lookup3(as_bytes("")), 0xDEADBEEFu);                            // lookup3.c, driver5
+    CHECK_EQUAL(lookup3(as_bytes("Four score and seven years ago")), 0x17770551u);
+    CHECK_EQUAL(fletcher32(as_bytes("\1\2\3\4")), 0x05080406u);  // words 0102 and 0304
+    CHECK_EQUAL(fletcher32(as_bytes("\1\2\3")), 0x05040402u);
+    CHECK_EQUAL(fletcher32(as_bytes("\xFF\xFF")), 0xFFFFFFFFu);
+    CHECK_EQUAL(fletcher32({}), 0u);
+    std::string ones(1 << 18, '\xFF');
+    CHECK_EQUAL(fletcher32(as_bytes(ones)), 0xFFFFFFFFu);
+}
+
+TEST(inflate_reads_all_three_kinds_of_blocks) {  // streams of Python's zlib
+    std::string period, squares;
+    for (int i = 0; i < 80; ++i) period += static_cast<char>(37 * (i % 40) % 251);
+    for (int i = 0; i < 400; ++i) squares += static_cast<char>(i * i / 7 % 11);
+    const std::string kept = unhex("7801015000afff") + period + unhex("bf4d2539");  // level 0
+    const std::string fixed = unhex(
+        "78016350f5ca9fb2f31e876e50f99c83cf044ca3ea979c7c27619bd4bee6e23705d7acfe2d3799357c8ba6ef6120521d00bf4d2539");
+    const std::string dynamic = unhex(
+        "78daedccc10dc040080341630b0ed37fc121523ac8f7f63d5a0041e53154668d9a872d6774724e2a30eecd835837cc8ef4c7a6e812bc8e81"
+        "b73bfb377b00eec40784");
+    CHECK(inflates_to(kept, period) == nullptr);
+    CHECK(inflates_to(fixed, period) == nullptr);
+    CHECK(inflates_to(dynamic, squares) == nullptr);
+    CHECK(inflates_to(unhex("789c030000000001"), "") == nullptr);
+    const std::string skewed = fixture("skewed");  // codes of up to 15 bits
+    std::string expected, mixed;
+    for (size_t k = 0, a = 1, b = 1; k < 17; ++k, std::swap(a, b), b += a)
+        expected += std::string(a, static_cast<char>(k));
+    for (size_t i = 0; i < 4180; ++i) mixed += expected[i * 2531 % 4180];
+    CHECK(skewed == mixed);
+
+    for (const auto& [stream, text] : {std::pair(kept, period), {fixed, period}, {dynamic, squares}}) {
+        for (size_t cut = 0; cut < stream.size(); ++cut) CHECK(inflates_to(stream.substr(0, cut), text) != nullptr);
+        CHECK(inflates_to(stream + "x", text) != nullptr);
+        CHECK(inflates_to(stream, text + "x") != nullptr);
+        CHECK(inflates_to(stream, text.substr(1)) != nullptr);
+        for (size_t bit = 0; bit < 8 * stream.size(); ++bit) {  // no damage of one bit goes unnoticed
+            std::string damaged = stream;
+            damaged[bit / 8] = static_cast<char>(damaged[bit / 8] ^ 1 << bit % 8);
+            // What may change: the level in the header, a hint; bits to fill up a byte.
+            const bool filling = stream == kept ? bit >= 19 && bit < 24 : bit >= 8 * (stream.size() - 5);
+            CHECK(inflates_to(damaged, text) != nullptr || bit / 8 == 1 || filling);
+        }
+    }
+}
+
+TEST(inflate_refuses_invalid_streams) {
+    const auto wrong = [](const std::string& hex, size_t size) {
+        const char* message = inflates_to(unhex(hex), std::string(size, 'a'));
+        return std::string(message == nullptr ? "nothing" : message);
+    };
+    CHECK_EQUAL(wrong("7802030000000001", 0), "no zlib header");
+    CHECK_EQUAL(wrong("78bb030000000001", 0), "no zlib header");  // with a dictionary
+    CHECK_EQUAL(wrong("789c070000000001", 0), "a block of type 3");
+    CHECK_EQUAL(wrong("789c010100000061616161", 1), "a stored block whose length does not match its complement");
+    CHECK_EQUAL(wrong("789c030200ffffffff", 9), "a distance to before the start");
+    CHECK_EQUAL(wrong("789c030000000002", 0), "data that does not match its Adler-32 checksum");
+    CHECK_EQUAL(wrong("789c03000000000001", 0), "bytes after the end of the compressed data");
+    CHECK_EQUAL(wrong("789cfdff0000000000000000000000000000", 9), "too many codes");
+    CHECK_EQUAL(wrong("789c05c000000000000000000000000000", 9), "an invalid code length");
+    CHECK_EQUAL(wrong("789c05e0ffff0f00000000000000000000", 9), "an invalid code of code lengths");
+}
+
+TEST(hdf5_files_made_by_h5py_are_read) {
+    using enum Hdf5Filter;
+    for (const char* name : {"old", "latest", "latest-1.12"}) {
+        const Hdf5File file = parse(fixture(name));
+        check_contents(name, file, std::string(name) == "latest-1.12" ? 62 : 63);
+        const auto type = [&](const char* path) { return file.find(path) == nullptr ? "none" : file.find(path)->type; };
+        CHECK_EQUAL(type("types/float32"), "float32");
+        CHECK_EQUAL(type("types/float64_big"), "float64, big-endian");
+        CHECK_EQUAL(type("types/int8"), "int8");
+        CHECK_EQUAL(type("types/uint64_big"), "uint64, big-endian");
+        CHECK_EQUAL(type("types/bool"), "bool");
+        CHECK_EQUAL(type("types/enumeration"), "enumeration uint16");
+        CHECK_EQUAL(type("text/scalar"), "text of 13 bytes");
+        CHECK_EQUAL(type("strange/soft"), "none");
+        CHECK_EQUAL(type("strange/named"), "none");
+        CHECK(file.find("types/scalar")->shape.empty());
+        CHECK(file.find("types/none")->shape == (Shape{0, 4}));
+        CHECK(file.find("types/null")->shape == Shape{0});
+        CHECK(file.find("chunks/fixed_gzip")->shape == (Shape{7, 9, 2}));
+        CHECK(file.find("filters/sdf")->filters == (std::vector{shuffle, deflate, fletcher}));
+        CHECK(file.find("filters/fds")->filters == (std::vector{fletcher, deflate, shuffle}));
+        CHECK_EQUAL(file.find("types/float32")->stored, size_t{60});
+        CHECK_EQUAL(file.find("chunks/holes")->stored, size_t{16});
+        CHECK_EQUAL(file.read_text(*file.find("text/scalar")), "tanh_gaussian");
+        for (const char* text : {"nul_ended", "nul_padded", "spaces"})
+            CHECK_EQUAL(file.read_text(*file.find("text/" + std::string(text))), "relu");
+
+        for (const char* path : {"compound", "variable", "half", "array", "lzf", "shared", "reference"}) {
+            const Hdf5Dataset* dataset = file.find("strange/" + std::string(path));
+            CHECK(dataset != nullptr && !dataset->unsupported.empty());
+            if (dataset != nullptr) CHECK_FAILS("hdf5.unsupported", file.read_floats(*dataset));
+        }
+        CHECK_FAILS("hdf5.type", file.read_floats(*file.find("text/scalar")));
+        CHECK_FAILS("hdf5.type", file.read_text(*file.find("text/two")));
+        CHECK_FAILS("hdf5.type", file.read_text(*file.find("types/int8")));
+    }
+}
+
+TEST(hdf5_large_indexes_and_groups_are_read) {
+    check_contents("old_large", parse(fixture("old_large")), 6);
+    check_contents("latest_large", parse(fixture("latest_large")), 6);
+    check_contents("edges", parse(fixture("edges")), 2);
+    check_contents("many_old", parse(fixture("many_old")), 401);
+    check_contents("long_names", parse(fixture("long_names")), 301);
+    const Hdf5File many = parse(fixture("many_latest"));
+    check_contents("many_latest", many, 5001);
+    for (int i = 0; i < 5000; ++i) CHECK(many.find("many/episode_" + std::to_string(i)) != nullptr);
+    CHECK(many.find("many/episode_5000") == nullptr);
+    CHECK(many.find("many") == nullptr);
+}
+
+TEST(hdf5_superblocks_of_every_version_are_read) {
+    const std::string base = fixture("userblock");
+    CHECK_EQUAL(int{base[1024 + 8]}, 0);
+    check_contents("userblock", parse(base), 1);
+    const int versions[] = {0, 1, 2, 3};
+    const char* names[] = {"small_old", "superblock1", "superblock2", "small_latest"};
+    for (size_t i = 0; i < 4; ++i) {
+        const std::string bytes = fixture(names[i]);
+        CHECK_EQUAL(int{bytes[8]}, versions[i]);
+        check_contents(names[i], parse(bytes), i == 0 || i == 3 ? 9 : 1);
+    }
+}
+
+TEST(hdf5_files_of_d4rl_are_read) {
+    const Hdf5File file = parse(fixture("d4rl-1.12"));
+    check_contents("d4rl", file, 14);
+    CHECK(file.find("observations")->shape == (Shape{700, 11}));
+    CHECK(file.find("observations")->filters == std::vector{Hdf5Filter::deflate});
+    CHECK_EQUAL(file.find("infos/qpos")->type, "float64");
+    CHECK_EQUAL(file.read_text(*file.find("metadata/algorithm")), "SAC");
+    CHECK_EQUAL(file.read_doubles(*file.find("metadata/iteration"))[0], -125.0);
+    const std::vector<uint8_t> flags = file.read_flags(*file.find("terminals"));
+    CHECK_EQUAL(flags.size(), size_t{700});
+    for (size_t i = 0; i < flags.size(); ++i) CHECK_EQUAL(int{flags[i]}, static_cast<int>(37 * i % 251 % 2));
+    CHECK_FAILS("hdf5.flag", file.read_flags(*file.find("rewards")));
+}
+
+TEST(hdf5_files_of_minari_are_read) {
+    const Hdf5File file = parse(fixture("minari"));
+    check_contents("minari", file, 72);
+    for (size_t e = 0; e < 12; ++e) {
+        const Hdf5Dataset* dataset = file.find("episode_" + std::to_string(e) + "/infos/qpos");
+        CHECK(dataset != nullptr && dataset->shape == (Shape{21 + e, 3}));
+    }
+}
+
+TEST(hdf5_damage_that_a_checksum_covers_is_found) {
+    const std::string latest = fixture("latest");
+    const Hdf5File file = parse(latest);
+    const auto damaged = [&](uint64_t at) {
+        std::string bytes = latest;
+        bytes[at] = static_cast<char>(bytes[at] ^ 1);
+        return parse(bytes);
+    };
+    for (const char* path : {"filters/f", "filters/df", "filters/sdf"}) {
+        const Hdf5Chunk& chunk = file.find(path)->chunks[3];
+        CHECK_FAILS("hdf5.checksum", const Hdf5File f = damaged(chunk.address + 5); f.read_floats(*f.find(path)));
+        CHECK_FAILS("hdf5.checksum", const Hdf5File f = damaged(chunk.address + chunk.size - 1);
+                    f.read_floats(*f.find(path)));
+    }
+    const Hdf5Chunk& chunk = file.find("filters/sd")->chunks[0];
+    CHECK_FAILS("hdf5.deflate", const Hdf5File f = damaged(chunk.address + chunk.size - 1);
+                f.read_floats(*f.find("filters/sd")));
+    const std::string small = fixture("small_latest");
+    const auto structures = checksummed(small);
+    CHECK(structures.size() > 15);
+    for (const auto& [begin, end] : structures) {
+        std::string bytes = small;
+        bytes[end + 3] = static_cast<char>(bytes[end + 3] ^ 1);
+        CHECK_FAILS("hdf5.checksum", parse(bytes));
+    }
+    try {
+        const Hdf5File f = damaged(chunk.address + chunk.size - 1);
+        f.read_floats(*f.find("filters/sd"));
+    } catch (const Error& error) {
+        CHECK_EQUAL(error.what(),
+                    "test: \"filters/sd\": chunk at offset " + std::to_string(chunk.address) +
+                        ": found data that does not match its Adler-32 checksum; the file is damaged, use "
+                        "another copy");
+    }
+}
+
+TEST(hdf5_files_cut_off_anywhere_give_errors) {
+    for (const char* name : {"small_old", "small_latest"}) {
+        const std::string whole = fixture(name);
+        const bool old = whole[8] == 0;
+        for (size_t size = 0; size < whole.size(); ++size) {
+            std::string cut = whole.substr(0, size);
+            CHECK_FAILS(size < 8 ? "hdf5.format" : "hdf5.truncated", parse(cut));
+            if (size < 96) continue;
+            set_u64(cut, old ? 40 : 28, size);  // the superblock now agrees, so the reader goes on
+            if (!old) seal(cut, {{0, 44}});
+            CHECK(survives(cut));
+        }
+    }
+}
+
+TEST(hdf5_files_changed_at_random_give_errors_or_values) {
+    const Random random{test_seed(), Stream::data_set};
+    uint64_t step = 0;
+    for (const char* name : {"small_old", "small_latest", "minari", "superblock2"}) {
+        const std::string whole = fixture(name);
+        const auto structures = checksummed(whole);
+        std::vector<uint64_t> addresses = {undefined_address, whole.size() - 1, uint64_t{1} << 63, 0};
+        std::vector<size_t> pointers;
+        for (size_t at = 0; at + 8 <= whole.size(); ++at)
+            if (u64(whole, at) >= 40 && u64(whole, at) < whole.size()) pointers.push_back(at);
+        for (const size_t at : pointers) addresses.push_back(u64(whole, at));
+        for (int round = 0; round < 1200; ++round, ++step) {
+            std::string bytes = whole;
+            const uint64_t changes = 1 + random.below(4, step, 0);
+            for (uint32_t c = 1; c <= changes; ++c) {
+                const size_t at = random.below(bytes.size() - 8, step, 4 * c);
+                const uint64_t kind = random.below(4, step, 4 * c + 1), value = random.below(256, step, 4 * c + 2);
+                if (kind == 0) bytes[at] = static_cast<char>(value);
+                if (kind == 1) bytes[at] = static_cast<char>(bytes[at] ^ 1 << value % 8);
+                if (kind == 2) bytes[at] = static_cast<char>(value < 128 ? 0 : 255);
+                if (kind == 3)  // a pointer to something else, or in a circle
+                    set_u64(bytes, pointers[random.below(pointers.size(), step, 4 * c + 3)],
+                            addresses[random.below(addresses.size(), step, 4 * c + 2)]);
+            }
+            if (round % 2 == 0) seal(bytes, structures);  // past the checksums
+            if (!survives(bytes))
+                report_failure(__FILE__, __LINE__, std::string(name) + ": round " + std::to_string(round));
+        }
+    }
+}
+
+TEST(hdf5_writer_makes_files_that_the_reader_reads) {
+    const Folder folder;
+    const std::string path = folder / "out.hdf5";
+    const size_t n = 300001;  // above the buffer's size
+    std::vector<float> floats(3 * n);
+    std::vector<double> doubles(2 * n);
+    std::vector<int32_t> integers(n);
+    std::vector<uint8_t> flags(n);
+    for (size_t i = 0; i < floats.size(); ++i) floats[i] = static_cast<float>(formula("float32", i));
+    for (size_t i = 0; i < doubles.size(); ++i) doubles[i] = formula("float64", i);
+    for (size_t i = 0; i < n; ++i) integers[i] = static_cast<int32_t>(formula("int32", i));
+    for (size_t i = 0; i < n; ++i) flags[i] = static_cast<uint8_t>(formula("bool", i));
+    const auto write = [&] {
+        Hdf5Writer out(path);
+        out.add("observations", {n, 3}, floats);
+        out.begin<double>("infos/qpos", {n, 2});
+        for (size_t at = 0; at < 2 * n; at += 777)
+            out.append(std::span<const double>(doubles).subspan(at, std::min<size_t>(777, 2 * n - at)));
+        out.add("infos/steps", {n}, integers);
+        out.add("terminals", {n}, flags);
+        out.add("none", {0, 3}, std::vector<float>());
+        out.text("metadata/algorithm", "SAC");
+        out.text("metadata/empty", "");
+        out.add("metadata/iteration", {}, std::span<const int32_t>(integers).first(1));
+        out.add("metadata/policy/fc0/weight", {5, 2}, std::span<const float>(floats).first(10));
+        for (int i = 0; i < 40; ++i)
+            out.add("many/episode_" + std::to_string(i), {1}, std::span<const int32_t>(integers).first(1));
+        CHECK(!std::filesystem::exists(path) || read_file(path).size() > 0);
+        out.close();
+    };
+    write();
+    CHECK(!std::filesystem::exists(path + ".tmp"));
+    const Hdf5File file = open_hdf5(path);
+    check_contents("written", file, 49);
+    CHECK_EQUAL(file.find("observations")->type, "float32");
+    CHECK_EQUAL(file.find("infos/qpos")->type, "float64");
+    CHECK_EQUAL(file.find("infos/steps")->type, "int32");
+    CHECK_EQUAL(file.find("terminals")->type, "bool");
+    CHECK(file.find("observations")->shape == (Shape{n, 3}));
+    CHECK(file.find("metadata/iteration")->shape.empty());
+    CHECK(file.read_flags(*file.find("terminals")) == flags);
+    CHECK_EQUAL(file.read_text(*file.find("metadata/algorithm")), "SAC");
+    CHECK_EQUAL(file.read_text(*file.find("metadata/empty")), "");
+    const std::string digest = sha256_of_file(path);
+    write();
+    CHECK_EQUAL(sha256_of_file(path), digest);
+}
+
+TEST(hdf5_writer_refuses_what_does_not_fit) {
+    const Folder folder;
+    const std::string path = folder / "out.hdf5";
+    const std::vector<float> three(3);
+    const std::vector<uint8_t> flags = {0, 1, 2};
+    const auto add = [&](Hdf5Writer& out, const std::string& name, const Shape& shape) { out.add(name, shape, three); };
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {2}));
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {4}); out.close());
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {4}); add(out, "b", {3}));
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {uint64_t{1} << 40, uint64_t{1} << 40}));
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); out.begin<double>("a", {3}); out.append(three));
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); out.begin<int32_t>("a", {3}); out.append(three));
+    CHECK_FAILS("hdf5.flag", Hdf5Writer out(path); out.add("a", {3}, flags));
+    for (const char* name : {"", "/a", "a/", "a//b", "x", "x/y", "g", ".", "\xFF", "a\n"}) {
+        CHECK_FAILS("hdf5.name", Hdf5Writer out(path); add(out, "x", {3}); add(out, "g/y", {3}); add(out, name, {3}));
+    }
+    CHECK_FAILS("file.write", Hdf5Writer out(folder / "missing/file"));
+    CHECK(std::filesystem::is_empty(folder.path));
+
+    const pid_t child = ::fork();  // a disk that is full after 4 kB
+    if (child == 0) {
+        std::signal(SIGXFSZ, SIG_IGN);
+        const rlimit limit{4096, 4096};
+        ::setrlimit(RLIMIT_FSIZE, &limit);
+        try {
+            Hdf5Writer out(path);
+            for (int i = 0; i < 1000; ++i) add(out, std::to_string(i), {3});
+            out.close();
+        } catch (const Error& error) {
+            ::_exit(error.id == "file.write" && error.what() == path + ".tmp: cannot write it: File too large" ? 7 : 1);
+        }
+        ::_exit(0);
+    }
+    int status = 0;
+    CHECK(::waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 7);
+    CHECK(std::filesystem::is_empty(folder.path));
+}
+
+TEST(hdf5_circles_end_in_errors) {
+    const Folder folder;
+    const std::string path = folder / "out.hdf5";
+    {
+        Hdf5Writer out(path);
+        out.add("g/x", {1}, std::array{1.0f});
+        out.close();
+    }
+    const std::string bytes = read_file(path);
+    const uint64_t root = u64(bytes, 64), tree = u64(bytes, 80), leaf = u64(bytes, tree + 32);
+    std::string circle = bytes;
+    set_u64(circle, leaf + 16, root);  // "g" is the root group
+    CHECK_FAILS("hdf5.cycle", parse(circle));
+    circle = bytes;
+    circle[root + 16] = 0x10;  // the header's only message: it continues where it is
+    set_u64(circle, root + 24, root + 16);
+    set_u64(circle, root + 32, 24);
+    CHECK_FAILS("hdf5.cycle", parse(circle));
+    circle = bytes;
+    circle[tree + 5] = 1;  // a node that is its own child
+    set_u64(circle, tree + 32, tree);
+    CHECK_FAILS("hdf5.format", parse(circle));
+    CHECK_FAILS("hdf5.format", parse(std::string(5000, 'x')));
+    CHECK_FAILS("hdf5.format", parse(""));
+    CHECK_FAILS("file.open", open_hdf5(folder / "missing"));
+    CHECK_FAILS("file.not_regular", open_hdf5(folder.path.string()));
+}
+
+TEST(hdf5_sizes_out_of_proportion_are_refused) {
+    const Folder folder;
+    const std::string path = folder / "out.hdf5";
+    {
+        Hdf5Writer out(path);
+        out.add("x", {3, 1}, std::array{1.0f, 2.0f, 3.0f});
+        out.close();
+    }
+    const std::string bytes = read_file(path);
+    const size_t shape = bytes.find(std::string("\3\0\0\0\0\0\0\0\1\0\0\0\0\0\0\0", 16));
+    for (const uint64_t rows : {uint64_t{4}, uint64_t{1} << 25, uint64_t{1} << 32, uint64_t{1} << 62, ~uint64_t{0}}) {
+        std::string damaged = bytes;
+        set_u64(damaged, shape, rows);
+        CHECK_FAILS(rows == 4 ? "hdf5.format" : "hdf5.too_large", parse(damaged));
+    }
+}
