@@ -111,7 +111,8 @@ void bench_updates(const Kernel& kernel, int threads) {
                          settings, GridWorld{});
         }
 #ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
-        const Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
+        Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
+        set_setting(gym, "behaviour", "random");
         bench_update(kernel, count, "halfcheetah, preset paper", gym,
                      MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
 #endif
