@@ -2,16 +2,17 @@
 //   sec. III-A      g_t and d_t                     returns_to_go, discounted_returns, relabel
 //   sec. III-A      D_offline, D_online             offline_set, ReplayBuffer
 //   sec. IV-B.1     the table Q, eq. (4)            EpisodicMemory::update    (the paper's rule between (3) and (5))
-//   sec. IV-B.2     K(s_q), eqs. (5) and (6)        search, neighbours, approximate_return, remembered_action
+//   sec. IV-B.2     K(s_q), eqs. (5) and (6)        nearest, search, approximate_return, remembered_action
 //   sec. IV-B.3     eq. (7)                         weight
 // Promises: exact nearest neighbours; every tie has a stated winner, so results depend on the order of updates and
 // look-ups and on nothing else (not on when the search tree was built, not on a save and load in between); a refused
 // trajectory leaves the table as it was. Leaves out: networks, environments, files, threads (search() is safe in many).
 //
 // Memory per entry, with projected_dim 4, action_dim 8 and a full table of 2e6: 88 bytes saved (key 16, projected state
-// 16, action 32, e 8, priority 8, age 8) and 58 derived (hash slots 8.4, search tree 25, eviction heap 24): 291 MB.
-// Building the tree takes 8 more per entry for a moment. The raw state is not kept: its key and projection are.
-// At that size, on one 2.5 GHz Xeon core: a look-up (K = 2) takes 4 microseconds, building the tree 1.1 seconds.
+// 16, action 32, e 8, priority 8, age 8) and 77 to 93 derived (hash slots 8.4, search tree 45 to 61, eviction heap 24):
+// 330 to 362 MB. Building the tree takes 8 more per entry for a moment. The raw state is not kept: its key and
+// projection are. At that size, on one core of an EPYC 9005: a look-up (K = 2, thousands at once) takes 0.6 to 0.7
+// microseconds, an insertion 1.3, one that evicts 2.2, building the tree 0.7 seconds.
 #pragma once
 
 #include <algorithm>
@@ -20,6 +21,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -213,26 +215,6 @@ constexpr uint32_t no_entry = 0xFFFFFFFF;
 struct Neighbour {
     float distance;  // q(s_q, s_k) = ||s_q - s_k||^2, in the projected space
     uint32_t entry;
-    uint64_t age;  // insertion number: smaller is older
-};
-
-// The order of neighbours. Ties: smaller distance, then older entry; ages differ, so this is a total order.
-inline bool closer(const Neighbour& a, const Neighbour& b) {
-    return a.distance < b.distance || (a.distance == b.distance && a.age < b.age);
-}
-
-// The K closest of all neighbours offered so far.
-struct Closest {
-    size_t K;
-    std::vector<Neighbour> list = {};                                             // closest first
-    Neighbour worst = {std::numeric_limits<float>::infinity(), no_entry, ~0ull};  // to be beaten
-
-    void offer(const Neighbour& candidate) {
-        if (!closer(candidate, worst)) return;
-        if (list.size() == K) list.pop_back();
-        list.insert(std::upper_bound(list.begin(), list.end(), candidate, closer), candidate);
-        if (list.size() == K) worst = list.back();
-    }
 };
 
 inline float squared_distance(const float* a, const float* b, size_t dim) {
@@ -241,111 +223,472 @@ inline float squared_distance(const float* a, const float* b, size_t dim) {
     return sum;
 }
 
-// A k-d tree with bounding boxes. Points are cut at the middle INDEX of the widest dimension, rounded to whole leaves,
-// so that any number of equal points gives the same balanced shape: every leaf but the last is full. Inner nodes over m
-// leaves form a block of m - 1: the node, those of its left half, those of its right half; no child needs a pointer.
-// Box 2 j + c is that of child c of inner node j (both in one cache line when dim = 4); the last one is the root's.
+// What the tree knows of the table. An age is an insertion number: smaller is older, and no two are equal.
+struct Points {
+    const float* rows;  // [entry, dim]
+    const uint64_t* ages;
+
+    // The order of neighbours. Ties: smaller distance, then older entry.
+    bool closer(const Neighbour& a, const Neighbour& b) const {
+        return a.distance < b.distance || (a.distance == b.distance && ages[a.entry] < ages[b.entry]);
+    }
+};
+
+// A search for the nearest entries to a point.
+struct Query {
+    const float* point;
+    uint32_t skipped;  // the entry that does not count, or no_entry
+    Neighbour* best;   // room for K of them; found, closest first:
+    size_t found = 0;
+};
+
+// A tree of bounding boxes, 16 to a node, that grows like a B-tree: all leaves are equally deep, a full node splits in
+// two. (Guttman, "R-trees", SIGMOD 1984.) In level 0 the lanes of a node hold entries; in a level above, nodes of the
+// level below, each with its box and the age of its oldest entry. The lanes lie side by side: one pass of vector code
+// gives 16 distances. Splits keep boxes apart, which is what makes a search short; nothing else depends on the shape.
 struct BoxTree {
-    static constexpr size_t leaf_size = 16;
-    size_t dim = 0, count = 0;      // points
-    uint64_t built_at = 0;          // insertions into the table before this tree was built
-    std::vector<float> leaves;      // [leaf, dim, leaf_size]: copies, side by side, so that a leaf is scanned in lanes
-    std::vector<uint32_t> entries;  // [count] in the order of the leaves
-    std::vector<float> boxes;       // [box, 2, dim]: lowest, highest coordinate
-    std::vector<uint64_t> oldest;   // [box] smallest age inside
+    static constexpr size_t lanes = 16;
+    static constexpr size_t fewest = 4;        // lanes in use, but for the root; those in use come first
+    static constexpr size_t comfortable = 12;  // lanes in use after building: room for more
+    // Two halves of a node may overlap by this part of its extent. None at all: insertion takes twice as long, because
+    // more is built anew. 0.1: a look-up takes a third longer.
+    static constexpr float tolerance = 0.02f;
+
+    template <class Number>
+    struct alignas(64) Lanes : std::array<Number, lanes> {};
+
+    struct Level {
+        std::vector<Lanes<float>> boxes;      // [node, dim, side] lowest, highest coordinate; in level 0 one for both
+        std::vector<Lanes<uint32_t>> child;   // [node] entry, or node of the level below; no_entry: nothing
+        std::vector<Lanes<uint64_t>> oldest;  // [node] not in level 0: there the table has it
+        std::vector<uint32_t> home;           // [child] the node it is in
+        std::vector<uint32_t> unused;         // nodes
+    };
+
+    size_t dim = 0;
+    std::vector<Level> levels = {};
+    uint32_t root = 0;  // in the last level
+
+    static size_t sides(size_t level) { return level == 0 ? 1 : 2; }
+    size_t top() const { return levels.size() - 1; }
+    Lanes<uint32_t>& child(size_t level, size_t node) { return levels[level].child[node]; }
+    Lanes<float>& low(size_t level, size_t node, size_t d) {
+        return levels[level].boxes[(node * dim + d) * sides(level)];
+    }
+    Lanes<float>& high(size_t level, size_t node, size_t d) {
+        return levels[level].boxes[(node * dim + d + 1) * sides(level) - 1];
+    }
+    size_t lane_of(size_t level, size_t node, uint32_t what) const {
+        const Lanes<uint32_t>& list = levels[level].child[node];
+        return static_cast<size_t>(std::find(list.begin(), list.end(), what) - list.begin());
+    }
+    size_t used(size_t level, size_t node) const { return lane_of(level, node, no_entry); }
+
+    // ---- nodes and lanes
+
+    template <class Column>
+    static void grow(Column& column, size_t size, const typename Column::value_type& value) {
+        if (size > column.capacity()) column.reserve(size + size / 4);
+        column.resize(size, value);
+    }
+
+    uint32_t add_node(size_t level) {
+        Level& at = levels[level];
+        const uint32_t node = at.unused.empty() ? static_cast<uint32_t>(at.child.size()) : at.unused.back();
+        if (!at.unused.empty()) return at.unused.pop_back(), node;
+        grow(at.boxes, (node + 1) * dim * sides(level), {});
+        grow(at.child, node + 1, {});
+        if (level > 0) grow(at.oldest, node + 1, {});
+        for (size_t lane = 0; lane < lanes; ++lane) clear_lane(level, node, lane);
+        return node;
+    }
+
+    // An empty lane is infinitely far from every point.
+    void clear_lane(size_t level, size_t node, size_t lane) {
+        child(level, node)[lane] = no_entry;
+        for (size_t d = 0; d < dim; ++d) {
+            high(level, node, d)[lane] = -INFINITY;
+            low(level, node, d)[lane] = INFINITY;
+        }
+    }
+
+    void set_child(size_t level, size_t node, size_t lane, uint32_t what) {
+        child(level, node)[lane] = what;
+        std::vector<uint32_t>& home = levels[level].home;
+        if (what >= home.size()) grow(home, what + 1, no_entry);
+        home[what] = static_cast<uint32_t>(node);
+    }
+
+    void move_lane(size_t level, size_t from, size_t from_lane, size_t to, size_t to_lane) {
+        set_child(level, to, to_lane, child(level, from)[from_lane]);
+        for (size_t d = 0; d < dim; ++d) {
+            low(level, to, d)[to_lane] = low(level, from, d)[from_lane];
+            high(level, to, d)[to_lane] = high(level, from, d)[from_lane];
+        }
+        if (level > 0) levels[level].oldest[to][to_lane] = levels[level].oldest[from][from_lane];
+    }
+
+    void erase_lane(size_t level, size_t node, size_t lane) {
+        const size_t last = used(level, node) - 1;
+        if (lane != last) move_lane(level, node, last, node, lane);
+        clear_lane(level, node, last);
+    }
+
+    void put_entry(const Points& points, size_t leaf, uint32_t entry) {
+        const size_t lane = used(0, leaf);
+        set_child(0, leaf, lane, entry);
+        for (size_t d = 0; d < dim; ++d) low(0, leaf, d)[lane] = points.rows[entry * dim + d];
+    }
+
+    void put_node(const Points& points, size_t level, size_t node, uint32_t below) {
+        const size_t lane = used(level, node);
+        set_child(level, node, lane, below);
+        enclose(points, level, node, lane);
+    }
+
+    // Fits the box in a lane to what is below. Returns whether it did not fit.
+    bool enclose(const Points& points, size_t level, size_t node, size_t lane) {
+        const uint32_t below = child(level, node)[lane];
+        const size_t n = used(level - 1, below);
+        bool changed = false;
+        const auto set = [&](auto& old, auto now) { changed |= old != now, old = now; };
+        for (size_t d = 0; d < dim; ++d) {
+            const Lanes<float>&lows = low(level - 1, below, d), &highs = high(level - 1, below, d);
+            set(low(level, node, d)[lane], *std::min_element(lows.begin(), lows.begin() + n));
+            set(high(level, node, d)[lane], *std::max_element(highs.begin(), highs.begin() + n));
+        }
+        uint64_t oldest = ~uint64_t{0};
+        for (size_t i = 0; i < n; ++i)
+            oldest = std::min(oldest, level > 1 ? levels[level - 1].oldest[below][i] : points.ages[child(0, below)[i]]);
+        set(levels[level].oldest[node][lane], oldest);
+        return changed;
+    }
+
+    // ---- building
 
     using Order = std::vector<std::pair<float, uint32_t>>;  // (coordinate to cut by, entry)
+    using Iterator = Order::iterator;
 
-    size_t leaf_count() const { return (count + leaf_size - 1) / leaf_size; }
-
-    void build(const std::vector<float>& points, const std::vector<uint64_t>& ages, size_t point_dim, uint64_t now) {
+    // A tree of the table's first n entries.
+    void build(const Points& points, size_t point_dim, uint32_t n) {
         dim = point_dim;
-        count = ages.size();
-        built_at = now;
-        const size_t m = leaf_count();
-        leaves.assign(m * dim * leaf_size, 0.0f);
-        entries.assign(count, no_entry);
-        boxes.assign(m * 4 * dim, 0.0f);
-        oldest.assign(m * 2, 0);
-        Order order(count);
-        for (size_t i = 0; i < count; ++i) order[i].second = static_cast<uint32_t>(i);
-        if (count > 0) build_node(order, points.data(), ages, 0, 2 * m - 2, 0, m);
+        levels.assign(1, {});
+        for (size_t room = lanes; n > room; room *= comfortable) levels.emplace_back();
+        Order order(n);
+        for (uint32_t i = 0; i < n; ++i) order[i].second = i;
+        root = build_node(points, top(), order.begin(), order.end());
     }
 
-    // Leaves [first, last): inner node `node`, if more than one, with its own box at `box`.
-    void build_node(Order& order, const float* points, const std::vector<uint64_t>& ages, size_t node, size_t box,
-                    size_t first, size_t last) {
-        const auto begin = order.begin() + static_cast<std::ptrdiff_t>(first * leaf_size);
-        const auto end = order.begin() + static_cast<std::ptrdiff_t>(std::min(last * leaf_size, count));
-        float *low = &boxes[box * 2 * dim], *high = low + dim;
-        std::copy_n(points + begin->second * dim, dim, low);
-        std::copy_n(points + begin->second * dim, dim, high);
-        oldest[box] = ages[begin->second];
-        for (auto point = begin; point != end; ++point) {
-            for (size_t d = 0; d < dim; ++d) {
-                low[d] = std::min(low[d], points[point->second * dim + d]);
-                high[d] = std::max(high[d], points[point->second * dim + d]);
-            }
-            oldest[box] = std::min(oldest[box], ages[point->second]);
+    uint32_t build_node(const Points& points, size_t level, Iterator begin, Iterator end) {
+        const uint32_t node = add_node(level);
+        if (level == 0) {
+            for (auto i = begin; i != end; ++i) put_entry(points, node, i->second);
+            return node;
         }
-        if (last - first == 1) return copy_leaf(order, points, first);
+        size_t room = 1;  // in a comfortable node of the level below
+        for (size_t i = 0; i < level; ++i) room *= comfortable;
+        const size_t n = static_cast<size_t>(end - begin);  // at most half of 16^(level + 1), or else all there is
+        build_lanes(points, level, node, std::clamp((n + room - 1) / room, fewest, lanes - 1), begin, end);
+        return node;
+    }
+
+    void build_lanes(const Points& points, size_t level, uint32_t node, size_t count, Iterator begin, Iterator end) {
+        if (count == 1) return put_node(points, level, node, build_node(points, level - 1, begin, end));
+        const Iterator middle =
+            begin + (end - begin) * static_cast<ptrdiff_t>(count / 2) / static_cast<ptrdiff_t>(count);
+        cut(points, begin, middle, end);
+        build_lanes(points, level, node, count / 2, begin, middle);
+        build_lanes(points, level, node, count - count / 2, middle, end);
+    }
+
+    // Entries before `middle` get the lower coordinates in the widest dimension.
+    void cut(const Points& points, Iterator begin, Iterator middle, Iterator end) const {
         size_t widest = 0;
-        for (size_t d = 1; d < dim; ++d)
-            if (high[d] - low[d] > high[widest] - low[widest]) widest = d;
-        for (auto point = begin; point != end; ++point) point->first = points[point->second * dim + widest];
-        const size_t middle = (first + last) / 2;
-        std::nth_element(begin, order.begin() + static_cast<std::ptrdiff_t>(middle * leaf_size), end);
-        build_node(order, points, ages, node + 1, 2 * node, first, middle);
-        build_node(order, points, ages, node + middle - first, 2 * node + 1, middle, last);
+        float extent = -1.0f;
+        for (size_t d = 0; d < dim; ++d) {
+            float least = INFINITY, most = -INFINITY;
+            for (auto i = begin; i != end; ++i) {
+                least = std::min(least, points.rows[i->second * dim + d]);
+                most = std::max(most, points.rows[i->second * dim + d]);
+            }
+            if (most - least > extent) extent = most - least, widest = d;
+        }
+        for (auto i = begin; i != end; ++i) i->first = points.rows[i->second * dim + widest];
+        std::nth_element(begin, middle, end);
     }
 
-    void copy_leaf(const Order& order, const float* points, size_t leaf) {
-        for (size_t i = leaf * leaf_size; i < std::min((leaf + 1) * leaf_size, count); ++i) {
-            entries[i] = order[i].second;
-            for (size_t d = 0; d < dim; ++d)
-                leaves[(leaf * dim + d) * leaf_size + i % leaf_size] = points[entries[i] * dim + d];
+    // ---- coming and going
+
+    // Down to a leaf by the nearest boxes; what is full on the way splits before it is entered.
+    void insert(const Points& points, uint32_t entry) {
+        const float* point = points.rows + entry * dim;
+        if (used(top(), root) == lanes) {
+            levels.emplace_back();
+            const uint32_t below = root;
+            root = add_node(top());
+            put_node(points, top(), root, below);
+        }
+        uint32_t node = root;
+        for (size_t level = top(); level > 0; --level) {
+            size_t lane = nearest_lane(level, node, point, 0);
+            send_for(level - 1, child(level, node)[lane]);
+            if (used(level - 1, child(level, node)[lane]) == lanes) {
+                split(points, level, node, lane);
+                lane = nearest_lane(level, node, point, used(level, node) - 2);  // of the halves
+            }
+            for (size_t d = 0; d < dim; ++d) {
+                float &least = low(level, node, d)[lane], &most = high(level, node, d)[lane];
+                if (point[d] < least) least = point[d];
+                if (point[d] > most) most = point[d];
+            }
+            uint64_t& oldest = levels[level].oldest[node][lane];
+            oldest = std::min(oldest, points.ages[entry]);
+            node = child(level, node)[lane];
+        }
+        put_entry(points, node, entry);
+    }
+
+    // Makes two nodes, in the last two lanes, of the one in a lane: its lanes move where a plane parts them well, else
+    // its entries are divided and both halves built anew.
+    void split(const Points& points, size_t level, size_t node, size_t lane) {
+        const uint32_t below = child(level, node)[lane];
+        erase_lane(level, node, lane);
+        const Parting parting = best_parting(level - 1, below);
+        if (parting.overlap <= tolerance) {
+            const uint32_t halves[2] = {add_node(level - 1), add_node(level - 1)};
+            for (size_t i = 0; i < lanes; ++i) {
+                const uint32_t half = halves[i >= parting.first];
+                move_lane(level - 1, below, parting.order[i].second, half, used(level - 1, half));
+            }
+            release(level - 1, below);
+            for (const uint32_t half : halves) put_node(points, level, node, half);
+        } else {
+            Order order;
+            take_apart(level - 1, below, order);
+            const Iterator middle = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
+            cut(points, order.begin(), middle, order.end());
+            put_node(points, level, node, build_node(points, level - 1, order.begin(), middle));
+            put_node(points, level, node, build_node(points, level - 1, middle, order.end()));
         }
     }
 
-    // Squared distance from the query to the nearest point c of a box, never above the computed distance of any point x
-    // inside: |query - c| <= |query - x| in each coordinate, and rounding, being monotone and odd, keeps this <=, as do
-    // squaring and adding in the same order with the rounding after each.
-    float bound(const float* query, size_t box) const {
-        const float *low = &boxes[box * 2 * dim], *high = low + dim;
-        float sum = 0.0f;
+    struct Parting {
+        float overlap = INFINITY, extent = -INFINITY;       // in the dimension of the plane
+        size_t first = 0;                                   // lanes on its lower side
+        std::array<std::pair<float, size_t>, lanes> order;  // (centre, lane)
+    };
+
+    // Of the planes that leave enough lanes on both sides: a tolerable or else the least overlap, then the widest
+    // dimension, then the most even halves.
+    Parting best_parting(size_t level, size_t node) {
+        Parting best;
         for (size_t d = 0; d < dim; ++d) {
-            const float gap = query[d] - std::min(std::max(query[d], low[d]), high[d]);
-            sum += gap * gap;
+            const Lanes<float>&lows = low(level, node, d), &highs = high(level, node, d);
+            Parting next;
+            for (size_t i = 0; i < lanes; ++i) next.order[i] = {0.5f * lows[i] + 0.5f * highs[i], i};
+            std::sort(next.order.begin(), next.order.end());
+            Lanes<float> most = {}, least = {};  // of the lanes up to i, of those from i on
+            for (size_t i = 0; i < lanes; ++i)
+                most[i] = std::max(highs[next.order[i].second], i > 0 ? most[i - 1] : -INFINITY);
+            for (size_t i = lanes; i-- > 0;)
+                least[i] = std::min(lows[next.order[i].second], i + 1 < lanes ? least[i + 1] : INFINITY);
+            next.extent = most[lanes - 1] - least[0];
+            if (!(next.extent > 0.0f)) continue;
+            for (size_t i = 0; i <= lanes - 2 * fewest; ++i) {  // 8, 7, 9, 6, 10 ...
+                next.first = i % 2 ? lanes / 2 - (i + 1) / 2 : lanes / 2 + i / 2;
+                next.overlap = std::max(tolerance, (most[next.first - 1] - least[next.first]) / next.extent);
+                if (next.overlap < best.overlap || (next.overlap == best.overlap && next.extent > best.extent))
+                    best = next;
+            }
+        }
+        return best;
+    }
+
+    void release(size_t level, uint32_t node) {
+        for (size_t lane = 0; lane < lanes; ++lane) clear_lane(level, node, lane);
+        levels[level].unused.push_back(node);
+    }
+
+    // Appends the entries below a node, and gives up the nodes.
+    void take_apart(size_t level, uint32_t node, Order& order) {
+        for (size_t lane = 0; lane < used(level, node); ++lane) {
+            const uint32_t what = child(level, node)[lane];
+            if (level == 0) order.push_back({0.0f, what});
+            if (level > 0) take_apart(level - 1, what, order);
+        }
+        release(level, node);
+    }
+
+    void remove(const Points& points, uint32_t entry) {
+        const uint32_t leaf = levels[0].home[entry];
+        erase_lane(0, leaf, lane_of(0, leaf, entry));
+        tidy(points, 0, leaf);
+    }
+
+    // After a lane has gone, or its box has shrunk: a node with too few lanes is given up, and what it held put back.
+    void tidy(const Points& points, size_t level, uint32_t node) {
+        if (level == top()) {
+            if (level > 0 && used(level, node) == 1) root = child(level, node)[0], levels.pop_back();
+            return;
+        }
+        const uint32_t parent = levels[level + 1].home[node];
+        const size_t lane = lane_of(level + 1, parent, node);
+        if (used(level, node) >= fewest) {
+            if (enclose(points, level + 1, parent, lane)) tidy(points, level + 1, parent);
+            return;
+        }
+        Order order;
+        take_apart(level, node, order);
+        erase_lane(level + 1, parent, lane);
+        tidy(points, level + 1, parent);
+        for (const auto& [coordinate, entry] : order) insert(points, entry);
+    }
+
+    // ---- searching
+
+    // Squared distances from a point to the boxes of a node; in level 0 to its entries, as squared_distance() has them.
+    // To a box: never above the computed distance of any point x inside. For the nearest point c of the box,
+    // |point - c| <= |point - x| in each coordinate, and rounding, being monotone and odd, keeps this <=, as do squaring
+    // and adding in the same order with the rounding after each.
+    [[gnu::always_inline]] inline Lanes<float> distances(size_t level, size_t node, const float* point) const {
+        const size_t step = sides(level);
+        const Lanes<float>* box = &levels[level].boxes[node * dim * step];
+        Lanes<float> sum = {};
+        for (size_t d = 0; d < dim; ++d, box += step) {
+            const float x = point[d], *lows = box[0].data(), *highs = box[step - 1].data();
+#pragma GCC unroll 1  // vectors of lanes, not of dimensions
+            for (size_t i = 0; i < lanes; ++i) {
+                const float gap = x - std::min(std::max(x, lows[i]), highs[i]);
+                sum[i] += gap * gap;
+            }
         }
         return sum;
     }
 
-    // offer(entry, distance) meets every point that could be closer than best.worst, nearer half first. A box whose
-    // bound equals the worst distance can still hold an older entry at just that distance.
-    template <class Offer>
-    void search(const Closest& best, const float* query, const Offer& offer, size_t node, size_t first,
-                size_t last) const {
-        if (last - first == 1) return scan_leaf(best, query, offer, first);
-        const size_t middle = (first + last) / 2;
-        const float bounds[2] = {bound(query, 2 * node), bound(query, 2 * node + 1)};
-        const size_t nearer = bounds[1] < bounds[0];
-        for (const size_t child : {nearer, 1 - nearer}) {
-            if (bounds[child] > best.worst.distance) continue;
-            if (bounds[child] == best.worst.distance && oldest[2 * node + child] > best.worst.age) continue;
-            if (child == 0) search(best, query, offer, node + 1, first, middle);
-            if (child == 1) search(best, query, offer, node + middle - first, middle, last);
+    // One bit for each lane within reach.
+    [[gnu::always_inline]] static uint32_t within_reach(const Lanes<float>& distance, float reach) {
+        uint32_t mask = 0;
+        for (size_t i = 0; i < lanes; ++i) mask |= (distance[i] <= reach ? 1u : 0u) << i;
+        return mask;
+    }
+
+    // So that the node comes from memory while something else is done.
+    [[gnu::always_inline]] inline void send_for(size_t level, size_t node) const {
+        const size_t lines = dim * sides(level);
+        for (size_t i = 0; i < lines; ++i) __builtin_prefetch(&levels[level].boxes[node * lines + i]);
+        __builtin_prefetch(&levels[level].child[node]);
+    }
+
+    // Of the lanes from `first` on. Ties: the first.
+    EACH_TARGET size_t nearest_lane(size_t level, size_t node, const float* point, size_t first) const {
+        const Lanes<float> distance = distances(level, node, point);
+        float least = INFINITY;
+        for (size_t i = first; i < lanes; ++i) least = std::min(least, distance[i]);
+        return static_cast<size_t>(std::countr_zero(within_reach(distance, least) >> first)) + first;
+    }
+
+    struct Box {
+        float distance;
+        uint32_t node;  // in which it is a lane
+        uint16_t level, lane;
+    };
+
+    // A search under way: the node it has come to, and the boxes it has seen and not opened, the next one last.
+    struct Walk {
+        Query* query;
+        float reach;  // what is farther does not count
+        size_t level, node;
+        std::vector<Box> unopened;
+    };
+
+    // The K nearest entries to each point, but only those nearer than `limit`. Several walks take turns, so that the
+    // next node of each comes from memory while the others compute.
+    EACH_TARGET void search(const Points& points, std::vector<Query>& queries, size_t K, float limit) const {
+        std::vector<Walk> walks(std::min<size_t>(queries.size(), 16));
+        size_t begun = 0;
+        const auto begin = [&](Walk& walk) {
+            walk = {&queries[begun++], limit, top(), root, std::move(walk.unopened)};
+        };
+        for (Walk& walk : walks) begin(walk);
+        while (!walks.empty())
+            for (size_t i = 0; i < walks.size(); ++i) {
+                Walk& walk = walks[i];
+                if (walk.level == 0)
+                    scan_leaf(points, walk, K);
+                else
+                    scan_boxes(walk);
+                if (open_next(points, walk, K)) continue;
+                if (begun < queries.size()) {
+                    begin(walk);
+                } else {
+                    std::swap(walk, walks.back());
+                    walks.pop_back();
+                }
+            }
+    }
+
+    // Whether an entry, or a box whose oldest entry is that old, can be among the K nearest. At equal distances the
+    // older wins; the age is a reference because it lies elsewhere, and is seldom asked for.
+    [[gnu::always_inline]] static bool counts(const Points& points, const Walk& walk, size_t K, float distance,
+                                              const uint64_t& age) {
+        if (distance != walk.reach) return distance < walk.reach;
+        return walk.query->found == K && age < points.ages[walk.query->best[K - 1].entry];
+    }
+
+    [[gnu::always_inline]] inline void scan_leaf(const Points& points, Walk& walk, size_t K) const {
+        Query& query = *walk.query;
+        const Lanes<float> distance = distances(0, walk.node, query.point);
+        for (uint32_t mask = within_reach(distance, walk.reach); mask != 0; mask &= mask - 1) {
+            const size_t lane = static_cast<size_t>(std::countr_zero(mask));
+            const Neighbour next = {distance[lane], levels[0].child[walk.node][lane]};
+            if (next.entry == query.skipped || next.entry == no_entry) continue;
+            if (!counts(points, walk, K, next.distance, points.ages[next.entry])) continue;
+            size_t k = query.found < K ? query.found++ : K - 1;
+            for (; k > 0 && points.closer(next, query.best[k - 1]); --k) query.best[k] = query.best[k - 1];
+            query.best[k] = next;
+            if (query.found == K) walk.reach = query.best[K - 1].distance;
         }
     }
 
-    template <class Offer>
-    void scan_leaf(const Closest& best, const float* query, const Offer& offer, size_t leaf) const {
-        const float* block = &leaves[leaf * dim * leaf_size];
-        float distance[leaf_size] = {};
-        for (size_t d = 0; d < dim; ++d, block += leaf_size)
-            for (size_t i = 0; i < leaf_size; ++i) distance[i] += (block[i] - query[d]) * (block[i] - query[d]);
-        const size_t first = leaf * leaf_size;
-        for (size_t i = 0; i < std::min(leaf_size, count - first); ++i)
-            if (distance[i] <= best.worst.distance) offer(entries[first + i], distance[i]);
+    [[gnu::always_inline]] inline void scan_boxes(Walk& walk) const {
+        const Lanes<float> distance = distances(walk.level, walk.node, walk.query->point);
+        const auto oldest = [&](const Box& box) { return levels[box.level].oldest[box.node][box.lane]; };
+        const size_t first = walk.unopened.size();
+        for (uint32_t mask = within_reach(distance, walk.reach); mask != 0; mask &= mask - 1) {
+            const size_t lane = static_cast<size_t>(std::countr_zero(mask));
+            const Box box = {distance[lane], static_cast<uint32_t>(walk.node), static_cast<uint16_t>(walk.level),
+                             static_cast<uint16_t>(lane)};
+            const auto before = [&](const Box& other) {
+                return other.distance < box.distance || (other.distance == box.distance && oldest(other) < oldest(box));
+            };
+            size_t i = walk.unopened.size();
+            walk.unopened.push_back(box);
+            for (; i > first && before(walk.unopened[i - 1]); --i) walk.unopened[i] = walk.unopened[i - 1];
+            walk.unopened[i] = box;
+        }
+    }
+
+    // Goes to the next box that counts, and sends for its node. Returns whether there is one.
+    [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
+        while (!walk.unopened.empty()) {
+            const Box box = walk.unopened.back();
+            walk.unopened.pop_back();
+            const Level& above = levels[box.level];
+            if (!counts(points, walk, K, box.distance, above.oldest[box.node][box.lane])) continue;
+            walk.level = box.level - 1u;
+            walk.node = above.child[box.node][box.lane];
+            send_for(walk.level, walk.node);
+            return true;
+        }
+        return false;
+    }
+
+    size_t bytes() const {
+        size_t total = 0;
+        const auto add = [&](const auto& column) { total += column.capacity() * sizeof(column[0]); };
+        for (const Level& level : levels)
+            add(level.boxes), add(level.child), add(level.oldest), add(level.home), add(level.unused);
+        return total;
     }
 };
 
@@ -378,6 +721,16 @@ inline Words4 state_key(const float* state, size_t state_dim) {
     return h;
 }
 
+// K(s_q) of many queries s_q.
+struct Neighbourhoods {
+    size_t K = 0;
+    std::vector<Neighbour> rows = {};  // [query, K], closest first
+    std::vector<size_t> counts = {};   // [query] how many of a row are in use
+
+    size_t size() const { return counts.size(); }
+    std::span<const Neighbour> operator[](size_t i) const { return {rows.data() + i * K, counts[i]}; }
+};
+
 struct EpisodicMemory {
     struct Changes {
         uint64_t inserted = 0, improved = 0, kept = 0, evicted = 0;  // entries; the first three sum to T
@@ -402,11 +755,9 @@ struct EpisodicMemory {
     uint64_t accesses = 0, insertions = 0;
 
     // Derived: never saved, rebuilt by rebuild_derived().
-    std::vector<uint32_t> slots;   // hash table of entries: open addressing, linear probing, a power of two long
-    std::vector<HeapItem> heap;    // empty until the first eviction, then one item per entry
-    BoxTree tree;                  // over the entries with age < tree.built_at
-    std::vector<uint32_t> recent;  // the others, scanned one by one
-    static constexpr size_t recent_limit = 512;
+    std::vector<uint32_t> slots;  // hash table of entries: open addressing, linear probing, a power of two long
+    std::vector<HeapItem> heap;   // empty until the first eviction, then one item per entry
+    BoxTree tree;                 // over `projected`
 
     EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
         : config(settings),
@@ -457,7 +808,7 @@ struct EpisodicMemory {
         if (entry == no_entry) {
             ++changes.inserted;
             changes.evicted += size() == config.capacity;
-            return insert(key, project(state), action, d);
+            return insert(key, state, action, d);
         }
         count_access(entry);
         if (e[entry] < d) {
@@ -469,10 +820,11 @@ struct EpisodicMemory {
         }
     }
 
-    void insert(const Words4& key, const std::vector<float>& point, const float* action, double d) {
+    void insert(const Words4& key, const float* state, const float* action, double d) {
+        std::vector<float> point(dim);
+        project(state, point.data());
         const bool full = size() == config.capacity;
         const uint32_t entry = full ? evict() : append();
-        if (!full || age[entry] < tree.built_at) recent.push_back(entry);  // else it is there already
         set_row(keys, entry, key.data(), 4);
         set_row(projected, entry, point.data(), dim);
         set_row(actions, entry, action, A);
@@ -481,11 +833,14 @@ struct EpisodicMemory {
         priority[entry] = 0;
         count_access(entry);
         slots[find_slot(key)] = entry;
+        tree.insert(points(), entry);
         if (full) {
             heap.push_back({priority[entry], age[entry], entry});
             std::push_heap(heap.begin(), heap.end(), later);
         }
     }
+
+    Points points() const { return {projected.data(), age.data()}; }
 
     template <class Number>
     static void set_row(std::vector<Number>& column, size_t entry, const Number* row, size_t width) {
@@ -532,6 +887,7 @@ struct EpisodicMemory {
         const uint32_t entry = heap.back().entry;
         heap.pop_back();
         empty_slot(find_slot(key_of(entry)));
+        tree.remove(points(), entry);
         return entry;
     }
 
@@ -563,86 +919,73 @@ struct EpisodicMemory {
     // ---- sec. IV-B.2: neighbours
 
     // [state_dim] -> [dim]. Accumulated in double, rounded once. Without projection: the state itself.
-    std::vector<float> project(const float* state) const {
+    void project(const float* state, float* point) const {
         check_finite("state", state, S);
         constexpr double largest = std::numeric_limits<float>::max();
-        std::vector<float> point(state, state + (projection.empty() ? S : 0));
-        for (size_t row = 0; row < projection.size(); row += S) {
+        if (projection.empty()) std::copy_n(state, S, point);
+        for (size_t row = 0; row * S < projection.size(); ++row) {
             double sum = 0.0;
-            for (size_t i = 0; i < S; ++i) sum += projection[row + i] * state[i];
-            point.push_back(static_cast<float>(std::clamp(sum, -largest, largest)));  // finite whatever the state
+            for (size_t i = 0; i < S; ++i) sum += projection[row * S + i] * state[i];
+            point[row] = static_cast<float>(std::clamp(sum, -largest, largest));  // finite whatever the state
         }
-        for (float& coordinate : point) coordinate += 0.0f;  // -0 becomes +0
-        return point;
+        for (size_t d = 0; d < dim; ++d) point[d] += 0.0f;  // -0 becomes +0
     }
 
-    // The K nearest entries to a point, closest first; `skipped` is passed over. Specification:
-    std::vector<Neighbour> nearest_plain(const float* point, uint32_t skipped = no_entry) const {
-        Closest best{static_cast<size_t>(config.K)};
-        for (uint32_t i = 0; i < size(); ++i)
-            if (i != skipped) best.offer({squared_distance(&projected[i * dim], point, dim), i, age[i]});
-        return best.list;
-    }
-
-    // The same from the tree and the recent entries. A slot reused since the tree was built is younger than the tree:
-    // its old point is passed over there, its new one is among the recent. So a stale tree is slower, never wrong.
-    std::vector<Neighbour> nearest(const float* point, uint32_t skipped = no_entry) const {
-        Closest best{static_cast<size_t>(config.K)};
-        for (const uint32_t i : recent)
-            if (i != skipped) best.offer({squared_distance(&projected[i * dim], point, dim), i, age[i]});
-        const auto offer = [&](uint32_t i, float distance) {
-            if (i != skipped && age[i] < tree.built_at) best.offer({distance, i, age[i]});
-        };
-        if (tree.count > 0) tree.search(best, point, offer, 0, 0, tree.leaf_count());
-        return best.list;
-    }
-
-    // WODTEM sec. IV-B.2: K(s_q) = {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first.
-    // Changes nothing, so many threads may search at once; then count_accesses() on each result in a fixed order,
-    // before the next update() (which may give an entry number to another state).
-    std::vector<Neighbour> search(const float* state) const {
-        const std::vector<float> point = project(state);
-        const auto own = [&] { return slots[find_slot(state_key(state, S))]; };
-        std::vector<Neighbour> found = nearest(point.data(), config.exclude_self ? own() : no_entry);
-        while (!found.empty() && !(found.back().distance < config.epsilon)) found.pop_back();
+    // WODTEM sec. IV-B.2: K(s_q) = {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for a
+    // projected s_q; `skipped` is passed over. Specification:
+    std::vector<Neighbour> nearest_plain(const float* point, uint32_t skipped) const {
+        std::vector<Neighbour> found;
+        for (uint32_t i = 0; i < size(); ++i) {
+            const float distance = squared_distance(&projected[i * dim], point, dim);
+            if (i != skipped && distance < config.epsilon) found.push_back({distance, i});
+        }
+        std::sort(found.begin(), found.end(), [&](auto& a, auto& b) { return points().closer(a, b); });
+        found.resize(std::min(found.size(), static_cast<size_t>(config.K)));
         return found;
     }
 
-    void count_accesses(const std::vector<Neighbour>& found) {
+    // The same from the tree, for many points at once.
+    Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped) const {
+        Neighbourhoods found{static_cast<size_t>(config.K), {}, {}};
+        found.rows.resize(skipped.size() * found.K);
+        std::vector<Query> queries;
+        for (size_t i = 0; i < skipped.size(); ++i)
+            queries.push_back({&at[i * dim], skipped[i], &found.rows[i * found.K]});
+        // The smallest float that is not below epsilon: the same floats are below both.
+        float limit = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
+        if (limit < config.epsilon) limit = std::nextafter(limit, INFINITY);
+        tree.search(points(), queries, found.K, limit);
+        for (const Query& query : queries) found.counts.push_back(query.found);
+        return found;
+    }
+
+    // K(s_q) of n states [n, state_dim]. Changes nothing, so many threads may search at once; then count_accesses() on
+    // each result in a fixed order, before the next update() (which may give an entry number to another state).
+    Neighbourhoods search(const float* states, size_t n) const {
+        std::vector<float> at(n * dim);
+        std::vector<uint32_t> skipped(n, no_entry);
+        for (size_t i = 0; i < n; ++i) {
+            project(states + i * S, &at[i * dim]);
+            if (config.exclude_self) skipped[i] = slots[find_slot(state_key(states + i * S, S))];
+        }
+        return nearest(at, skipped);
+    }
+
+    void count_accesses(std::span<const Neighbour> found) {
         for (const Neighbour& neighbour : found) count_access(neighbour.entry);
-    }
-
-    // search(), counted, from a fresh enough tree.
-    std::vector<Neighbour> neighbours(const float* state) {
-        refresh_index();
-        const std::vector<Neighbour> found = search(state);
-        count_accesses(found);
-        return found;
-    }
-
-    // Rebuilds the tree when too many entries are not in it: more than an eighth of it, or recent_limit (about a
-    // microsecond to scan). Who calls search() directly calls this after updates.
-    void refresh_index() {
-        if (recent.size() > std::min(recent_limit, tree.count / 8)) rebuild_index();
-    }
-
-    void rebuild_index() {
-        if (recent.empty()) return;
-        tree.build(projected, age, dim, insertions);
-        recent = {};
     }
 
     // ---- eqs. (5) to (7). `found` is K(s_q).
 
     // exp(-q_k) over exp(-q_1), the largest: the quotient in (5) is the same and no epsilon can make it 0 / 0. The float
     // exp: libm's in double gives other bits on other processors. Sums are in double.
-    static double similarity(const std::vector<Neighbour>& found, size_t k) {
+    static double similarity(std::span<const Neighbour> found, size_t k) {
         return std::exp(found[0].distance - found[k].distance);
     }
 
     // WODTEM eq. (5): e-hat(s_q) = sum_k p_k e_k, p_k = exp(-q(s_q, s_k)) / sum_k1 exp(-q(s_q, s_k1)).
     // NaN, that is unknown, for an empty K(s_q).
-    double approximate_return(const std::vector<Neighbour>& found) const {
+    double approximate_return(std::span<const Neighbour> found) const {
         double sum = 0.0, normaliser = 0.0;
         for (size_t k = 0; k < found.size(); ++k) {
             sum += similarity(found, k) * e[found[k].entry];
@@ -653,7 +996,7 @@ struct EpisodicMemory {
 
     // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
     // e reaches thousands, exp(89) overflows float: the largest e is subtracted first. Returns action_dim numbers.
-    const float* remembered_action(const std::vector<Neighbour>& found, double uniform) const {
+    const float* remembered_action(std::span<const Neighbour> found, double uniform) const {
         if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to remember");
         double best = e[found[0].entry], total = 0.0, cumulative = 0.0;
         for (const Neighbour& neighbour : found) best = std::max(best, e[neighbour.entry]);
@@ -671,14 +1014,14 @@ struct EpisodicMemory {
     // Is a_c "the historical optimal action": d >= e-hat(s)? Tested as sum_k p_k (e_k - d) <= 0, which is exact where
     // it matters: a rounded mean of equal numbers can exceed them, and give alpha for nothing. No neighbours: yes,
     // nothing speaks against it.
-    bool is_optimal(const std::vector<Neighbour>& found, double d) const {
+    bool is_optimal(std::span<const Neighbour> found, double d) const {
         double excess = 0.0;
         for (size_t k = 0; k < found.size(); ++k) excess += similarity(found, k) * (e[found[k].entry] - d);
         return excess <= 0.0;
     }
 
     // WODTEM eq. (7): w(s, a) = 1 if d >= e-hat(s), else alpha.
-    double weight(const std::vector<Neighbour>& found, double d, double alpha) const {
+    double weight(std::span<const Neighbour> found, double d, double alpha) const {
         return is_optimal(found, d) ? 1.0 : alpha;
     }
 
@@ -732,9 +1075,7 @@ struct EpisodicMemory {
             slot = i;
         }
         heap.clear();
-        tree = {};
-        recent.resize(n);
-        for (uint32_t i = 0; i < n; ++i) recent[i] = i;
+        tree.build(points(), dim, static_cast<uint32_t>(n));
     }
 
     // Bytes of memory in use, derived state included.
@@ -742,8 +1083,7 @@ struct EpisodicMemory {
         size_t total = 0;
         const auto add = [&](const auto& column) { total += column.capacity() * sizeof(column[0]); };
         for_each_column(*this, [&](const char*, const auto& column, size_t) { add(column); });
-        add(projection), add(slots), add(heap), add(recent);
-        add(tree.leaves), add(tree.entries), add(tree.boxes), add(tree.oldest);
-        return total;
+        add(projection), add(slots), add(heap);
+        return total + tree.bytes();
     }
 };

@@ -668,7 +668,7 @@ struct Batch {
     std::vector<float> mean;                 // [n] 1 / (batch_size |C^t|): over a window's steps, then windows
     std::vector<float> weights;              // [n] w(s_c, a_c)
     std::vector<uint32_t> numbers;           // [n] window * context_length + step: who draws which random number
-    std::vector<std::vector<Neighbour>> neighbours;  // [n] K(s_c)
+    Neighbourhoods neighbours;               // [n] K(s_c)
 };
 
 // WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t: the steps of a window.
@@ -735,8 +735,14 @@ void consult_memory(const Run& run, Batch& batch) {
     if (!run.remembers()) return;
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
     const Random random = run.random(Stream::remembered_action);
+    std::vector<float> keys;
+    for (const float* state : batch.raw_states) {
+        const std::vector<float> key = memory_key(run.agent, state);
+        keys.insert(keys.end(), key.begin(), key.end());
+    }
+    batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
     for (size_t i = 0; i < batch.weights.size(); ++i) {
-        std::vector<Neighbour> found = run.memory.search(memory_key(run.agent, batch.raw_states[i]).data());
+        const std::span<const Neighbour> found = batch.neighbours[i];
         batch.weights[i] =
             static_cast<float>(run.memory.weight(found, batch.discounted_returns[i], run.agent.settings.alpha));
         if (!run.memory.is_optimal(found, batch.discounted_returns[i])) {
@@ -745,7 +751,6 @@ void consult_memory(const Run& run, Batch& batch) {
             for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
                 batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
         }
-        batch.neighbours.push_back(std::move(found));
     }
 }
 
@@ -868,7 +873,6 @@ void learn_part(Run& run, Part& part, uint32_t number) {
 // One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
 void update(Run& run) {
     std::vector<Part> parts(run.parts.count);
-    run.memory.refresh_index();
     const auto learn = [&](int number, int) {
         Part& part = parts[static_cast<size_t>(number)];
         try {

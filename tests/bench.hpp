@@ -124,39 +124,51 @@ void bench_updates(const Kernel& kernel, int threads) {
 
 // Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
 void bench_memory(size_t entries) {
+    constexpr size_t queries = 5000, arrivals = 1000, rounds = 15;
     MemoryConfig config{};
     config.state_dim = config.projected_dim = 4;
     config.action_dim = 8;
-    config.capacity = entries;
+    config.capacity = entries + (rounds + 1) * arrivals;
     config.K = 2;
     config.epsilon = 0.1;
     EpisodicMemory memory(config, 0);
     const Random random{1, Stream::data_set};
-    const auto state_of = [&](size_t i) {
-        std::array<float, 4> state;
-        for (uint32_t j = 0; j < 4; ++j) state[j] = static_cast<float>(10 * random.uniform(i, j));
-        return state;
-    };
+    std::vector<float> states, asked;
+    for (size_t i = 0; i < config.capacity + rounds * arrivals; ++i)
+        for (uint32_t j = 0; j < 4; ++j) states.push_back(static_cast<float>(10 * random.uniform(i, j)));
     const std::array<float, 8> action{};
     EpisodicMemory::Changes changes;
-    const double insertion = seconds_of([&] {
-        for (size_t i = 0; i < entries; ++i) memory.update_one(changes, state_of(i).data(), action.data(), 1.0);
+    const float* next = states.data();
+    const auto insert = [&](size_t n) {
+        for (size_t i = 0; i < n; ++i, next += 4) memory.update_one(changes, next, action.data(), 1.0);
+    };
+    const double insertion = seconds_of([&] { insert(entries); });
+    const Spread arrival = timed(rounds, [&] { insert(arrivals); });
+    const double build =
+        seconds_of([&] { memory.tree.build(memory.points(), 4, static_cast<uint32_t>(memory.size())); });
+    insert(1);  // the first eviction orders all entries
+    const Spread exchange = timed(rounds - 2, [&] { insert(arrivals); });
+    for (size_t i = 0, at = 0; i < 40 * queries; ++i) {
+        at = (at + 7919) % entries;
+        asked.insert(asked.end(), &states[4 * at], &states[4 * at + 4]);
+        asked[4 * i] += 0.01f;
+    }
+    const float* ask = asked.data();
+    const Spread time = timed(39, [&] {
+        const Neighbourhoods found = memory.search(ask, queries);
+        for (size_t i = 0; i < queries; ++i) memory.count_accesses(found[i]);
+        ask += 4 * queries;
     });
-    const double build = seconds_of([&] { memory.rebuild_index(); });
-    constexpr size_t queries = 20000;
-    size_t at = 0;
-    const Spread time = timed(7, [&] {
-        for (size_t i = 0; i < queries; ++i) {
-            std::array<float, 4> state = state_of((at += 7919) % entries);
-            state[0] += 0.01f;
-            memory.neighbours(state.data());
-        }
-    });
+    const auto print = [](const char* what, const Spread& spread, double n) {
+        std::printf("    %-42s %.3f us (%.3f to %.3f)\n", what, spread.median / n * 1e6, spread.low / n * 1e6,
+                    spread.high / n * 1e6);
+    };
     std::printf(
-        "  memory, %zu entries in 4 dimensions, K = 2, one core: look-up %.2f us (%.2f to %.2f), insertion %.2f us, tree %.2f s, %.0f bytes an entry\n",
-        entries, time.median / queries * 1e6, time.low / queries * 1e6, time.high / queries * 1e6,
-        insertion / static_cast<double>(entries) * 1e6, build,
-        static_cast<double>(memory.bytes()) / static_cast<double>(entries));
+        "  memory, %zu entries in 4 dimensions, K = 2, one core: filled in %.2f s, tree built in %.2f s, %.0f bytes an entry\n",
+        entries, insertion, build, static_cast<double>(memory.bytes()) / static_cast<double>(memory.size()));
+    print("look-up, 5000 at once", time, queries);
+    print("insertion, 1000 in a row", arrival, arrivals);
+    print("insertion and eviction, 1000 in a row", exchange, arrivals);
 }
 
 #ifdef WODTEM_MUJOCO

@@ -43,17 +43,28 @@ EpisodicMemory table_of(const MemoryConfig& config, const std::vector<std::array
     return memory;
 }
 
+std::vector<Neighbour> search(const EpisodicMemory& memory, const float* state) {
+    const Neighbourhoods found = memory.search(state, 1);
+    return {found[0].begin(), found[0].end()};
+}
+
+std::vector<Neighbour> search_and_count(EpisodicMemory& memory, const float* state) {
+    const std::vector<Neighbour> found = search(memory, state);
+    memory.count_accesses(found);
+    return found;
+}
+
 std::vector<uint32_t> entries_of(const std::vector<Neighbour>& found) {
     std::vector<uint32_t> entries;
     for (const Neighbour& neighbour : found) entries.push_back(neighbour.entry);
     return entries;
 }
 
-bool same(const std::vector<Neighbour>& a, const std::vector<Neighbour>& b) {
-    if (a.size() != b.size()) return false;
-    for (size_t k = 0; k < a.size(); ++k)
-        if (a[k].distance != b[k].distance || a[k].entry != b[k].entry || a[k].age != b[k].age) return false;
-    return true;
+bool same(std::span<const Neighbour> a, std::span<const Neighbour> b) {
+    const auto equal = [](const Neighbour& x, const Neighbour& y) {
+        return x.entry == y.entry && std::bit_cast<uint32_t>(x.distance) == std::bit_cast<uint32_t>(y.distance);
+    };
+    return std::equal(a.begin(), a.end(), b.begin(), b.end(), equal);
 }
 
 // Keeps the bytes of every field by name: a checkpoint without a file.
@@ -141,17 +152,17 @@ void compare_with_naive(const MemoryConfig& config, int operations, uint32_t sal
             evicted += memory.update(one_step(state, draw(8, 4), d)).evicted;
             naive.update(state, draw(8, 4), d);
         } else {
-            const auto found = memory.neighbours(state.data());
+            const auto found = search_and_count(memory, state.data());
             const auto expected = naive.neighbours(state);
             CHECK_EQUAL(found.size(), expected.size());
             for (size_t k = 0; k < std::min(found.size(), expected.size()); ++k) {
                 CHECK_EQUAL(found[k].distance, expected[k].first.first);
-                CHECK_EQUAL(found[k].age, expected[k].first.second);
+                CHECK_EQUAL(memory.age[found[k].entry], expected[k].first.second);
                 CHECK_EQUAL(memory.e[found[k].entry], naive.table[expected[k].second].e);
             }
             found_any += !found.empty();
         }
-        if (random.below(1000, i, 5) == 0) memory.rebuild_index();
+        if (random.below(1000, i, 5) == 0) memory.rebuild_derived();  // as after a load
     }
     CHECK(evicted > 100 && found_any > 100);
     CHECK_EQUAL(memory.size(), naive.table.size());
@@ -165,20 +176,87 @@ void compare_with_naive(const MemoryConfig& config, int operations, uint32_t sal
     }
 }
 
-// n random points in `dim` dimensions on a lattice of step 1/8: many ties, some equal projections.
-EpisodicMemory cloud(int dim, int projected_dim, size_t n, int K) {
-    EpisodicMemory memory(
-        {.state_dim = dim, .action_dim = 1, .projected_dim = projected_dim, .capacity = n, .K = K, .epsilon = 1e9},
-        test_seed());
-    const Random random{test_seed(), Stream::data_set};
-    for (uint64_t i = 0; memory.insertions < n + n / 4; ++i) {  // the last fifth evicts
-        std::vector<float> state;
-        for (int d = 0; d < dim; ++d)
-            state.push_back(static_cast<float>(random.below(d < 2 ? 256 : 8, i, static_cast<uint32_t>(d))) / 8.0f);
-        memory.update(one_step(state, 0.0f, 0.0f));
-        if (memory.insertions == n - n / 8) memory.rebuild_index();  // the rest is recent, or reuses slots of the tree
+// Every entry is in the tree once, every box is the exact box of what is below, every node is as full as promised.
+void check_tree(const EpisodicMemory& memory) {
+    BoxTree tree = memory.tree;
+    std::vector<int> met(memory.size());
+    const auto below = [&](const auto& self, size_t level, uint32_t node) -> size_t {  // returns the nodes met
+        const size_t n = tree.used(level, node);
+        CHECK(n >= (level < tree.top() ? tree.fewest : level > 0 ? 2 : 0));
+        size_t nodes = 1;
+        for (size_t lane = 0; lane < n; ++lane) {
+            const uint32_t child = tree.child(level, node)[lane];
+            CHECK_EQUAL(tree.levels[level].home[child], node);
+            if (level == 0) ++met.at(child);
+            for (size_t d = 0; level == 0 && d < memory.dim; ++d)
+                CHECK_EQUAL(tree.low(0, node, d)[lane], memory.projected[child * memory.dim + d]);
+            if (level > 0) {
+                CHECK(!tree.enclose(memory.points(), level, node, lane));
+                nodes += self(self, level - 1, child);
+            }
+        }
+        for (size_t lane = n; lane < tree.lanes; ++lane) CHECK_EQUAL(tree.child(level, node)[lane], no_entry);
+        return nodes;
+    };
+    size_t nodes = below(below, tree.top(), tree.root);
+    for (const BoxTree::Level& level : tree.levels) nodes += level.unused.size();
+    for (const BoxTree::Level& level : tree.levels) nodes -= level.child.size();
+    CHECK_EQUAL(nodes, size_t{0});
+    CHECK(std::all_of(met.begin(), met.end(), [](int times) { return times == 1; }));
+}
+
+enum class Shape { uniform, lattice, clusters, walk, line, point };
+
+// State i of a sequence that fills space evenly, on a lattice with many ties (some states in it twice), in few small
+// heaps, along a path, along an axis from left to right, or not at all.
+std::vector<float> state_of(Shape shape, const Random& random, int dim, uint64_t i) {
+    std::vector<float> state;
+    for (uint32_t d = 0; d < static_cast<uint32_t>(dim); ++d) {
+        const auto x = static_cast<float>(random.uniform(i, d));
+        switch (shape) {
+            case Shape::uniform:
+                state.push_back(4 * x);
+                break;
+            case Shape::lattice:
+                state.push_back(std::floor(x * (d < 2 ? 32 : 4)) / 8);
+                break;
+            case Shape::clusters:
+                state.push_back(4 * static_cast<float>(random.uniform(i % 7, d)) + x * 1e-3f);
+                break;
+            case Shape::walk:
+                state.push_back(2 + 2 * std::sin(0.01f * static_cast<float>(i * (d + 1))) + x * 0.02f);
+                break;
+            case Shape::line:
+                state.push_back(d == 0 ? static_cast<float>(i) * 0.01f : 1.0f);
+                break;
+            case Shape::point:
+                state.push_back(1.0f);
+                break;
+        }
     }
-    return memory;
+    return state;
+}
+
+// The tree against the scan, for many points at once and for one alone: around the table's states and at them.
+void compare_with_plain(const EpisodicMemory& memory, uint64_t salt, uint32_t n = 40) {
+    const Random random{test_seed(), Stream::exploration};
+    std::vector<float> points;
+    std::vector<uint32_t> skipped;
+    for (uint32_t i = 0; i < n; ++i) {
+        const size_t near = memory.size() > 0 ? random.below(memory.size(), salt, i) : 0;
+        for (uint32_t d = 0; d < memory.dim; ++d) {
+            const float noise = random.normal(salt, i, d), scales[] = {0, 0.01f, 0.125f, 3};
+            points.push_back((memory.size() > 0 ? memory.projected[near * memory.dim + d] : 0) + scales[i % 4] * noise);
+            if (i % 4 == 2) points.back() = std::round(points.back() * 16) / 16;  // ties on a lattice
+        }
+        skipped.push_back(memory.size() > 0 && i % 3 == 0 ? static_cast<uint32_t>(near) : no_entry);
+    }
+    const Neighbourhoods found = memory.nearest(points, skipped);
+    for (uint32_t i = 0; i < n; ++i) {
+        const float* at = &points[i * memory.dim];
+        CHECK(same(found[i], memory.nearest_plain(at, skipped[i])));
+        if (i % 8 == 0) CHECK(same(found[i], memory.nearest({at, at + memory.dim}, {skipped[i]})[0]));
+    }
 }
 
 }  // namespace
@@ -330,7 +408,7 @@ TEST(a_refused_trajectory_or_query_leaves_the_table_as_it_was) {
     bad.discounted_returns.clear();
     CHECK_FAILS("memory.shape", memory.update(bad));
     const float evil = INFINITY;
-    CHECK_FAILS("memory.not_finite", memory.neighbours(&evil));
+    CHECK_FAILS("memory.not_finite", search_and_count(memory, &evil));
     CHECK(memory.size() == 1 && memory.accesses == 1);
     MemoryConfig wrong = small();
     CHECK_FAILS("memory.config", wrong.K = 0; EpisodicMemory(wrong, 1));
@@ -378,69 +456,120 @@ TEST(two_million_entries_fit_in_400_megabytes) {
     trajectory.rewards.resize(125001);
     relabel(trajectory, 11, 8, gamma_dr);
     CHECK_EQUAL(memory.update(trajectory).evicted, 1u);
-    memory.rebuild_index();
-    CHECK(memory.bytes() * 16 > 250000000 && memory.bytes() * 16 < 310000000);
+    CHECK(memory.bytes() * 16 > 250000000 && memory.bytes() * 16 < 370000000);
 }
 
 // ---- Neighbours
 
 TEST(the_tree_finds_what_a_linear_scan_finds) {
-    const Random random{test_seed(), Stream::exploration};
-    const struct {
+    const Random random{test_seed(), Stream::data_set};
+    struct Case {
         int dim, projected_dim;
-        size_t n;
+        size_t capacity;
         int K;
-    } cases[] = {
-        {1, 0, 1, 2},    {2, 0, 15, 1},   {2, 0, 16, 20},  {2, 0, 17, 2},    {3, 0, 33, 40},
-        {4, 0, 4000, 2}, {2, 0, 5000, 5}, {7, 4, 5000, 2}, {20, 16, 500, 3}, {11, 0, 2000, 2},
+        double epsilon;
     };
-    for (const auto& [dim, projected_dim, n, K] : cases) {
-        EpisodicMemory memory = cloud(dim, projected_dim, n, K);
-        std::vector<std::vector<Neighbour>> before;
-        for (int lap = 0; lap < 2; ++lap) {  // with a stale tree, then with a fresh one
-            for (uint32_t i = 0; i < 200; ++i) {
-                std::vector<float> point(memory.dim);
-                for (uint32_t d = 0; d < memory.dim; ++d)  // outside as well as inside, on the lattice and off it
-                    point[d] = static_cast<float>(random.below(320, i, d)) / (i % 2 ? 8.0f : 7.0f) - 4.0f;
-                if (i % 4 == 3) std::copy_n(&memory.projected[i % n * memory.dim], memory.dim, point.begin());
-                const uint32_t skipped = i % 3 ? no_entry : static_cast<uint32_t>(i % n);
-                const auto found = memory.nearest(point.data(), skipped);
-                CHECK(same(found, memory.nearest_plain(point.data(), skipped)));
-                if (lap == 0) before.push_back(found);
-                CHECK(same(found, before[i]));
+    std::vector<Case> cases = {{1, 0, 1, 2, 1e9},       {2, 0, 15, 1, 1e9},        {2, 0, 16, 20, 1e9},
+                               {2, 0, 17, 2, 0.1},      {3, 0, 33, 40, 1e9},       {4, 0, 3000, 2, 0.1},
+                               {2, 0, 3000, 5, 1},      {7, 4, 3000, 2, 1e9},      {20, 16, 500, 3, 1e9},
+                               {11, 0, 2000, 2, 1e300}, {4, 4, 300, 300, INFINITY}};
+    for (int dim = 1; dim <= 64; ++dim) cases.push_back({dim, dim % 2 ? 0 : dim, 200, 1 + dim % 3, 10});
+    uint64_t salt = 0;
+    for (const auto& [dim, projected_dim, capacity, K, epsilon] : cases)
+        for (const Shape shape :
+             {Shape::uniform, Shape::lattice, Shape::clusters, Shape::walk, Shape::line, Shape::point}) {
+            EpisodicMemory memory({.state_dim = dim,
+                                   .action_dim = 1,
+                                   .projected_dim = projected_dim,
+                                   .capacity = capacity,
+                                   .K = K,
+                                   .epsilon = epsilon,
+                                   .eviction = salt % 2 ? Eviction::lfu : Eviction::lru},
+                                  test_seed());
+            const auto check = [&] {
+                check_tree(memory);
+                compare_with_plain(memory, ++salt);
+            };
+            check();
+            for (uint64_t i = 0; i < 2 * capacity; ++i) {  // the second half evicts
+                memory.update(one_step(state_of(shape, random, dim, i), 0.0f, 0.0f));
+                if (i == 0 || i == capacity / 3 || i == capacity - 1 || i == capacity + capacity / 7) check();
             }
-            memory.rebuild_index();
-            CHECK(memory.recent.empty());
+            check();
+            memory.rebuild_derived();
+            check();
         }
+}
+
+TEST(the_tree_survives_any_order_of_coming_and_going) {
+    const Random random{test_seed(), Stream::data_set};
+    EpisodicMemory memory(
+        {.state_dim = 3, .action_dim = 1, .projected_dim = 0, .capacity = 4000, .K = 3, .epsilon = 1e9}, 1);
+    for (uint64_t i = 0; i < 4000; ++i)
+        memory.update(one_step(state_of(Shape::uniform, random, 3, i), 0.0f, static_cast<float>(i)));
+    std::vector<uint32_t> inside(4000), outside;
+    for (uint32_t i = 0; i < 4000; ++i) inside[i] = i;
+    // Shrinks to nothing and grows again, thrice: each step takes out or puts in an entry at random.
+    for (uint64_t i = 0; i < 30000; ++i) {
+        const bool shrinking = (i / 5000) % 2 == 0, take = random.below(10, i, 3) < (shrinking ? 9u : 1u);
+        std::vector<uint32_t>&from = take ? inside : outside, &to = take ? outside : inside;
+        if (from.empty()) continue;
+        std::swap(from[random.below(from.size(), i, 4)], from.back());
+        if (take) memory.tree.remove(memory.points(), from.back());
+        if (!take) memory.tree.insert(memory.points(), from.back());
+        to.push_back(from.back());
+        from.pop_back();
+        if (i % 997 != 0) continue;
+        Neighbourhoods found = memory.nearest(state_of(Shape::uniform, random, 3, i), {no_entry});
+        std::vector<Neighbour> expected;
+        const std::vector<float> point = state_of(Shape::uniform, random, 3, i);
+        for (const uint32_t entry : inside)
+            expected.push_back({squared_distance(&memory.projected[3 * entry], point.data(), 3), entry});
+        std::sort(expected.begin(), expected.end(), [&](auto& a, auto& b) { return memory.points().closer(a, b); });
+        expected.resize(std::min(expected.size(), size_t{3}));
+        CHECK(same(found[0], expected));
     }
+    for (const uint32_t entry : outside) memory.tree.insert(memory.points(), entry);
+    check_tree(memory);
 }
 
 TEST(many_equal_points_neither_break_nor_slow_the_tree) {
-    // 50,000 states that differ only in a coordinate the projection is made not to see.
+    // 50,000 states that differ only in a coordinate the projection is made not to see; 50,000 more evict all but 10,000.
     EpisodicMemory memory(
         {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 60000, .K = 2, .epsilon = 1}, 1);
     memory.projection = {1, 0, 0, 0, 1, 0};
-    for (int i = 0; i < 60000; ++i) {
+    for (int i = 0; i < 110000; ++i) {
         const auto x = static_cast<float>(i);
-        memory.update(one_step(i < 50000 ? std::vector<float>{3, 4, x} : std::vector<float>{x, x * 0.5f, 0}, 0, 0));
+        const bool elsewhere = i >= 50000 && i < 60000;
+        memory.update(one_step(elsewhere ? std::vector<float>{x, x * 0.5f, 0} : std::vector<float>{3, 4, x}, 0, 0));
+        if (i != 59999 && i != 109999) continue;
+        const float at[] = {3, 4, -1}, near[] = {3.25f, 4, -1};
+        const uint32_t oldest = 0;  // slots are given anew from the oldest on, so again to the first
+        for (int j = 0; j < 10000; ++j)
+            CHECK(entries_of(search(memory, at)) == (std::vector<uint32_t>{oldest, oldest + 1}));
+        CHECK(entries_of(search(memory, near)) == (std::vector<uint32_t>{oldest, oldest + 1}));
+        check_tree(memory);
+        CHECK(memory.tree.levels.size() <= 6);  // 8^5 leaves of 8 hold more
     }
-    memory.rebuild_index();
-    const float at[] = {3, 4, -1}, near[] = {3.25f, 4, -1};
-    for (int i = 0; i < 10000; ++i)
-        CHECK(entries_of(memory.search(at)) == (std::vector<uint32_t>{0, 1}));  // the oldest
-    CHECK(entries_of(memory.search(near)) == (std::vector<uint32_t>{0, 1}));
 }
 
 TEST(the_largest_states_overflow_to_infinite_distances_and_no_further) {
     EpisodicMemory memory(
-        {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 9, .K = 3, .epsilon = INFINITY}, 1);
+        {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 99, .K = 3, .epsilon = INFINITY}, 1);
     const std::vector<float> high(3, 3.4e38f), low(3, -3.4e38f), zero(3, 0.0f);
     for (const auto& state : {zero, low, high}) memory.update(one_step(state, 0, 0));
-    memory.rebuild_index();
-    const std::vector<float> point = memory.project(high.data());
-    CHECK(same(memory.nearest(point.data()), memory.nearest_plain(point.data())));
-    CHECK(entries_of(memory.nearest(point.data())) == (std::vector<uint32_t>{2, 0, 1}));  // both infinite: the older
-    CHECK(entries_of(memory.search(high.data())) == std::vector<uint32_t>{2});  // infinity is not below infinity
+    CHECK(entries_of(search(memory, high.data())) == std::vector<uint32_t>{2});  // infinity is not below infinity
+    for (int i = 0; i < 90; ++i) {                                               // and the tree can still cut and part
+        const float x = 3.4e38f * std::sin(static_cast<float>(i));
+        memory.update(one_step({x, -x, i % 2 ? x : 0.0f}, 0, 0));
+    }
+    check_tree(memory);
+    compare_with_plain(memory, 1);
+    for (const auto& state : {zero, low, high}) {
+        std::vector<float> point(2);
+        memory.project(state.data(), point.data());
+        CHECK(same(memory.nearest(point, {no_entry})[0], memory.nearest_plain(point.data(), no_entry)));
+    }
 }
 
 TEST(lookup_prefers_older_entry_on_tie) {
@@ -449,32 +578,36 @@ TEST(lookup_prefers_older_entry_on_tie) {
     config.K = 1;
     EpisodicMemory memory = table_of(config, {{0.5f, 0, 0}, {9, 0, 0}, {9, 0, 0}, {-0.5f, 0, 0}});
     const float zero = 0.0f;
-    CHECK(entries_of(memory.search(&zero)) == std::vector<uint32_t>{0});
+    CHECK(entries_of(search(memory, &zero)) == std::vector<uint32_t>{0});
     memory.update(one_step({-0.5f}, 0, 0));  // now 0.5 is the least used: its slot goes to 7, then 7's to 0.5
     memory.update(one_step({7}, 0, 0));
     memory.update(one_step({0.5f}, 0, 0));
     CHECK_EQUAL(memory.projected[0], 0.5f);
-    CHECK(entries_of(memory.search(&zero)) == std::vector<uint32_t>{2});  // older, though in a later slot
+    CHECK(entries_of(search(memory, &zero)) == std::vector<uint32_t>{2});  // older, though in a later slot
 }
 
 // WODTEM sec. IV-B.2 test
 TEST(neighbours_lie_strictly_within_epsilon) {
     MemoryConfig config = small();
     const float zero = 0.0f;
-    CHECK_EQUAL(EpisodicMemory(config, 1).neighbours(&zero).size(), size_t{0});  // empty table
+    CHECK_EQUAL(search(EpisodicMemory(config, 1), &zero).size(), size_t{0});  // empty table
     config.K = 5;
     config.epsilon = 0.25;
     EpisodicMemory memory =
         table_of(config, {{0.5f, 0, 0}, {std::nextafter(0.5f, 0.0f), 0, 0}, {-0.25f, 0, 0}, {0.75f, 0, 0}});
-    const auto found = memory.neighbours(&zero);  // 0.5 is at 0.25 exactly: out; K exceeds the entries
+    const auto found = search_and_count(memory, &zero);  // 0.5 is at 0.25 exactly: out; K exceeds the entries
     CHECK(entries_of(found) == (std::vector<uint32_t>{2, 1}));
+    memory.config.epsilon = 0.25 + 1e-12;  // no float, and the one below it is 0.25
+    CHECK(entries_of(search(memory, &zero)) == (std::vector<uint32_t>{2, 1, 0}));
+    memory.config.epsilon = 0.25 - 1e-12;
+    CHECK(entries_of(search(memory, &zero)) == (std::vector<uint32_t>{2, 1}));
     CHECK_EQUAL(found[0].distance, 0.0625f);                        // the distance is squared
     CHECK(memory.priority == (std::vector<uint64_t>{1, 2, 2, 1}));  // who passed epsilon was accessed
     memory.config.exclude_self = true;
     const float own = -0.25f;
-    CHECK(entries_of(memory.search(&own)).empty());
+    CHECK(entries_of(search(memory, &own)).empty());
     memory.config.exclude_self = false;
-    CHECK(entries_of(memory.search(&own)) == std::vector<uint32_t>{2});
+    CHECK(entries_of(search(memory, &own)) == std::vector<uint32_t>{2});
 }
 
 TEST(projection_keeps_squared_lengths_on_average_and_depends_on_the_seed) {
@@ -483,7 +616,9 @@ TEST(projection_keeps_squared_lengths_on_average_and_depends_on_the_seed) {
     for (uint32_t seed = 0; seed < 400; ++seed) {
         const EpisodicMemory memory(
             {.state_dim = 50, .action_dim = 1, .projected_dim = 4, .capacity = 1, .K = 1, .epsilon = 1}, seed);
-        const std::vector<float> point = memory.project(state.data()), origin(4, 0.0f);
+        const std::vector<float> origin(4, 0.0f);
+        std::vector<float> point(4);
+        memory.project(state.data(), point.data());
         mean += squared_distance(point.data(), origin.data(), 4) / 400.0;
     }
     CHECK_CLOSE(mean, 50.0,
@@ -496,18 +631,19 @@ TEST(projection_keeps_squared_lengths_on_average_and_depends_on_the_seed) {
 TEST(approximate_return_weighs_by_exp_of_minus_squared_distance) {
     EpisodicMemory memory = table_of(small(), {{0.0f, 0, 10}, {0.5f, 0, 20}});
     const float query = 0.125f;  // squared distances 1/64 and 9/64
-    const auto found = memory.neighbours(&query);
+    const auto found = search_and_count(memory, &query);
     const double a = std::exp(-1.0 / 64), b = std::exp(-9.0 / 64);
     CHECK_CLOSE(memory.approximate_return(found), (a * 10 + b * 20) / (a + b), 1e-5);
-    CHECK_EQUAL(memory.approximate_return({found[0]}), 10.0);
-    CHECK_CLOSE(memory.approximate_return({{400, 0, 0}, {400, 1, 1}}), 15.0, 1e-12);  // exp(-400) is 0 in float
+    CHECK_EQUAL(memory.approximate_return(std::span(found).first(1)), 10.0);
+    const std::vector<Neighbour> far = {{400, 0}, {400, 1}};
+    CHECK_CLOSE(memory.approximate_return(far), 15.0, 1e-12);  // exp(-400) is 0 in float
 }
 
 // WODTEM eq. (6) test
 TEST(remembered_action_follows_the_softmax_of_returns) {
     EpisodicMemory memory = table_of(small(), {{0.0f, 100, 1}, {0.25f, 200, 2}});
     const float query = 0.0f;
-    const auto found = memory.neighbours(&query);
+    const auto found = search_and_count(memory, &query);
     const double first = 1.0 / (1.0 + std::exp(1.0));  // p of the entry with e = 1
     CHECK_EQUAL(*memory.remembered_action(found, 0.0), 100.0f);
     CHECK_EQUAL(*memory.remembered_action(found, first - 1e-6), 100.0f);
@@ -522,10 +658,10 @@ TEST(remembered_action_follows_the_softmax_of_returns) {
 
 TEST(remembered_action_survives_large_returns_and_never_draws_probability_zero) {
     EpisodicMemory memory = table_of(small(), {{0.0f, 100, 0}, {0.25f, 200, 3000}, {0.5f, 300, -3000}});
-    const std::vector<Neighbour> found = {{0, 0, 0}, {0, 1, 1}, {0, 2, 2}};
+    const std::vector<Neighbour> found = {{0, 0}, {0, 1}, {0, 2}};
     for (const double uniform : {0.0, 0.5, 1.0 - 0x1p-53})
         CHECK_EQUAL(*memory.remembered_action(found, uniform), 200.0f);
-    const std::vector<Neighbour> equal(7, Neighbour{0, 1, 1});
+    const std::vector<Neighbour> equal(7, Neighbour{0, 1});
     CHECK_EQUAL(*memory.remembered_action(equal, 1.0 - 0x1p-53), 200.0f);
 }
 
@@ -533,8 +669,7 @@ TEST(remembered_action_survives_large_returns_and_never_draws_probability_zero) 
 TEST(weight_is_alpha_only_below_the_approximate_return) {
     const EpisodicMemory memory = table_of(small(), {{0.0f, 0, 0.1f}, {0.3f, 0, 0.1f}, {0.5f, 0, 4.0f}});
     const double e = memory.e[0];
-    const std::vector<Neighbour> lone = {{0, 0, 0}}, two = {{0.0f, 0, 0}, {0.09f, 1, 1}},
-                                 far = {{0.0f, 0, 0}, {0.25f, 2, 2}};
+    const std::vector<Neighbour> lone = {{0, 0}}, two = {{0.0f, 0}, {0.09f, 1}}, far = {{0.0f, 0}, {0.25f, 2}};
     for (const auto& found : {lone, two}) {
         CHECK_EQUAL(memory.weight(found, e, 0.9), 1.0);  // equal, whatever the rounding of the mean
         CHECK_EQUAL(memory.weight(found, std::nextafter(e, 1.0), 0.9), 1.0);
@@ -561,10 +696,9 @@ TEST(a_loaded_memory_continues_like_the_one_that_was_saved) {
             std::vector<float> state;
             for (uint32_t d = 0; d < 5; ++d) state.push_back(static_cast<float>(random.below(3, i, d)));
             if (i % 2) memory.update(one_step(state, static_cast<float>(i), random.normal(i, 9)));
-            return memory.neighbours(state.data());
+            return search_and_count(memory, state.data());
         };
         for (uint64_t i = 0; i < 3000; ++i) advance(saved, i);
-        saved.rebuild_index();
         ToyArchive archive;
         saved.visit(archive);
         archive.loading = true;
