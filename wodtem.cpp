@@ -705,23 +705,19 @@ Batch sample_batch(const Run& run, uint32_t first_window, uint32_t end_window) {
 }
 
 // The state by which the memory knows s: raw, or normalised if `keys` says so.
-std::vector<float> memory_key(const Agent& agent, const float* state) {
-    std::vector<float> key;
+void append_memory_key(std::vector<float>& to, const Agent& agent, const float* state) {
     if (agent.settings.keys == "normalized")
-        append_normalised(key, agent.normaliser, state);
+        append_normalised(to, agent.normaliser, state);
     else
-        key.assign(state, state + agent.spec.state_dim);
-    return key;
+        to.insert(to.end(), state, state + agent.spec.state_dim);
 }
 
 // WODTEM sec. IV-B.1, eq. (4): the table takes in a trajectory, once, as soon as it is there.
 void remember(Run& run, Trajectory trajectory) {
     if (!run.remembers()) return;
     std::vector<float> keys;
-    for (size_t at = 0; at < trajectory.states.size(); at += static_cast<size_t>(run.agent.spec.state_dim)) {
-        const std::vector<float> key = memory_key(run.agent, &trajectory.states[at]);
-        keys.insert(keys.end(), key.begin(), key.end());
-    }
+    for (size_t at = 0; at < trajectory.states.size(); at += static_cast<size_t>(run.agent.spec.state_dim))
+        append_memory_key(keys, run.agent, &trajectory.states[at]);
     trajectory.states = std::move(keys);
     const EpisodicMemory::Changes changes = run.memory.update(trajectory);
     run.progress.matched += static_cast<double>(changes.improved + changes.kept);
@@ -736,10 +732,7 @@ void consult_memory(const Run& run, Batch& batch) {
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
     const Random random = run.random(Stream::remembered_action);
     std::vector<float> keys;
-    for (const float* state : batch.raw_states) {
-        const std::vector<float> key = memory_key(run.agent, state);
-        keys.insert(keys.end(), key.begin(), key.end());
-    }
+    for (const float* state : batch.raw_states) append_memory_key(keys, run.agent, state);
     batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
     for (size_t i = 0; i < batch.weights.size(); ++i) {
         const std::span<const Neighbour> found = batch.neighbours[i];
