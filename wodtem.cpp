@@ -1877,9 +1877,11 @@ void command_collect(const Arguments& arguments) {
         fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none; the nearest is %s", id.c_str(),
              nearest_name(id, names).c_str());
     }
-    const int64_t steps = arguments["--steps"].empty() ? published_steps(id)
-                                                       : whole_number(arguments["--steps"], "--steps", 1, 100000000);
-    const int64_t seed = whole_number(arguments["--seed"].empty() ? "0" : arguments["--seed"], "--seed", 0, 2147483647);
+    [[maybe_unused]] const int64_t steps = arguments["--steps"].empty()
+                                               ? published_steps(id)
+                                               : whole_number(arguments["--steps"], "--steps", 1, 100000000);
+    [[maybe_unused]] const int64_t seed =
+        whole_number(arguments["--seed"].empty() ? "0" : arguments["--seed"], "--seed", 0, 2147483647);
     const std::string path =
         arguments["--out"].empty() ? std::string(own_folder) + "/" + file_name(*set) : arguments["--out"];
 #ifdef WODTEM_MUJOCO
@@ -1907,7 +1909,7 @@ void command_collect(const Arguments& arguments) {
     std::printf("%s: %lld steps; see: wodtem info %s\n", path.c_str(), static_cast<long long>(steps), path.c_str());
 #else
     fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s", path.c_str(),
-         steps + seed > 0 ? mujoco_advice : "");
+         mujoco_advice);
 #endif
 }
 
