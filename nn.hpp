@@ -18,12 +18,19 @@
 #include <cstring>
 #include <memory>
 #include <new>
+#include <numeric>
 #include <stdexcept>
 #include <string>
 #include <system_error>
 #include <thread>
 #include <type_traits>
 #include <vector>
+
+#if defined(__x86_64__) && !defined(__clang__)
+#include <cpuid.h>  // whether there is a matrix unit, and to ask for it
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Errors. Every failure is one sentence for the person at the terminal (what, where, expected and got, what to do) and
@@ -281,26 +288,78 @@ void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int
         }
 }
 
-// One tile of C from packed panels: a [depth, Rows], b [depth, Columns] (row stride b_stride), depth <= sum_block.
-// Writes (`add`: adds) the upper left rows x columns of the tile to c.
-using TileFunction = void (*)(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, int rows,
+// Matrix units multiply bf16, the upper half of a float. A float is the sum of bf16 parts, x = x_0 + x_1 + x_2, each the
+// nearest bf16 to what those before it leave over; a product is the sum of the products of parts i, j with i + j <
+// parts: one (`bf16`, relative error 2^-8), three of two parts each (`bf16x3`, 2^-16), or six of three (`bf16x6`, as
+// exact as float). The definition, for the order of additions: C takes in 32 k at a time, for these the products of
+// parts in turn, of each the sum over even k and the sum over odd k, added up from zero in order of k.
+inline float bf16_nearest(float x) {  // ties to even; infinity and the NaN that arithmetic makes stay what they are
+    uint32_t bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    bits = (bits + (bits >> 16 & 1) + 0x7FFF) & 0xFFFF0000;
+    std::memcpy(&x, &bits, sizeof bits);
+    return x;
+}
+
+// Part j of B that meets part i of A in turn n < parts - i: back and forth, small products first, so that most turns
+// find their part of B loaded.
+constexpr int part_of_b(int parts, int i, int n) { return i % 2 == 0 ? parts - 1 - i - n : n; }
+
+inline void matmul_parts_plain(View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
+                               Store store, int parts) {
+    const auto part = [](float x, int i) {
+        for (; i > 0; --i) x -= bf16_nearest(x);
+        return bf16_nearest(x);
+    };
+    for (int row = 0; row < M; ++row)
+        for (int column = 0; column < N; ++column) {
+            if (store == Store::overwrite) c(row, column) = 0;
+            for (int first = 0; first < K; first += 32)
+                for (int i = 0; i < parts; ++i)
+                    for (int n = 0; n < parts - i; ++n) {
+                        const int j = part_of_b(parts, i, n);
+                        float sums[2] = {};  // over even k and over odd k
+                        for (int k = first; k < std::min(K, first + 32); ++k)
+                            sums[k % 2] += part(a(row, k), i) * part(b(k, column), j);  // an exact product
+                        c(row, column) += sums[0] + sums[1];
+                    }
+        }
+}
+
+// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns] (row stride b_stride), depth <=
+// sum_block. Writes (`add`: adds) the upper left rows x columns of the tile to c.
+using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int b_stride, int depth, int rows,
                               int columns, bool add);
 
-// What a kernel must offer. Kernels of lower precision can join with panels and tiles of their own behind matmul().
+// Copies `used` lines of `depth` elements into a panel, filling up with zeros; element (k, w) of the panel comes from
+// view(k, w) offset by (first_k, first_w). Lines are rows of A or columns of B.
+using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_w, int depth, int used);
+
+// What a kernel must offer.
 struct Kernel {
-    const char* name;
+    const char *name, *precision;
+    const char* arithmetic;  // kernels of equal arithmetic give the same bits: "fused" multiply-add with one rounding,
+                             // "plain" with two (these are matmul_plain's), or the precision (matmul_parts_plain's)
+    int parts;               // bf16 parts of a float; 0: floats
     int tile_rows, tile_columns;
-    bool fused;  // multiply-add with one rounding: all fused kernels give the same bits, all others the plain ones
     bool (*supported)();
+    PackFunction pack_a, pack_b;
     TileFunction tile;
-    float (*burn)(int64_t rounds);  // arithmetic in registers alone, burn_flops() a round: the machine's peak
+    void (*prepare)(bool begin);  // called before and after a thread works on tiles
+    size_t panel_bytes(int width, int depth) const {
+        const int elements = width * (parts > 0 ? (depth + 31) / 32 * 32 : depth);
+        return static_cast<size_t>(elements) * (parts > 0 ? 2 * static_cast<size_t>(parts) : sizeof(float));
+    }
 };
-constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
 
 #if defined(__x86_64__) && !defined(__clang__)
 #define FUSED_KERNELS
 #endif
 #define ALWAYS_INLINE [[gnu::always_inline]] inline
+
+typedef float Float4 __attribute__((vector_size(16)));
+typedef float Float8 __attribute__((vector_size(32)));
+typedef float Float16 __attribute__((vector_size(64)));
 
 // sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so the fused form is one instruction by name.
 template <bool Fused, class Vector>
@@ -354,97 +413,8 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
         }
 }
 
-template <class Vector, bool Fused>
-ALWAYS_INLINE float burn_body(int64_t rounds) {
-    Vector sum[burn_chains], a = 0.999f - Vector{}, b = 0.001f - Vector{};
-#pragma GCC unroll 16
-    for (int i = 0; i < burn_chains; ++i) sum[i] = Vector{};
-    for (int64_t round = 0; round < rounds; ++round) {
-#pragma GCC unroll 16
-        for (int i = 0; i < burn_chains; ++i) {
-            if constexpr (Fused)
-                multiply_add<true>(sum[i], a, b);
-            else
-                sum[i] = sum[i] * a + b;
-        }
-#if defined(__x86_64__)
-        asm volatile("" : "+v"(a));  // a might have changed: no product may leave the loop
-#endif
-    }
-    Vector total = sum[0];
-#pragma GCC unroll 16
-    for (int i = 1; i < burn_chains; ++i) total += sum[i];
-    return total[0];
-}
-
-typedef float Float4 __attribute__((vector_size(16)));
-typedef float Float8 __attribute__((vector_size(32)));
-typedef float Float16 __attribute__((vector_size(64)));
-
-// A kernel for each instruction set: the same body, another vector, compiled for its own target.
-#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                               \
-    TARGET inline void tile_##NAME(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, \
-                                   int rows, int columns, bool add) {                                               \
-        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, a, b, b_stride, depth, rows, columns, add);            \
-    }                                                                                                               \
-    TARGET inline float burn_##NAME(int64_t rounds) { return burn_body<VECTOR, FUSED>(rounds); }                    \
-    inline const Kernel kernel_##NAME = {#NAME,                                                                     \
-                                         ROWS,                                                                      \
-                                         VECTORS * static_cast<int>(sizeof(VECTOR) / sizeof(float)),                \
-                                         FUSED,                                                                     \
-                                         [] { return static_cast<bool>(SUPPORTED); },                               \
-                                         tile_##NAME,                                                               \
-                                         burn_##NAME};
-
-#ifdef FUSED_KERNELS
-KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
-KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
-       __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-KERNEL(portable, , Float4, 4, 2, false, true)
-inline const Kernel* const kernels[] = {&kernel_avx512, &kernel_avx2, &kernel_portable};  // best first
-#else
-KERNEL(portable, , Float4, 4, 2, false, true)
-inline const Kernel* const kernels[] = {&kernel_portable};
-#endif
-
-inline double burn_flops(const Kernel& kernel) { return 2.0 * burn_chains * kernel.tile_columns / 2; }
-
-// By name, or the best one that the machine has for "auto". Errors: usage.kernel.
-inline const Kernel& choose_kernel(const std::string& name) {
-    std::string available;
-    for (const Kernel* kernel : kernels) {
-        if (!kernel->supported()) continue;
-        if (name == "auto" || name == kernel->name) return *kernel;
-        available += std::string(available.empty() ? "" : ", ") + kernel->name;
-    }
-    for (const Kernel* kernel : kernels)
-        if (name == kernel->name)
-            fail("usage.kernel", "this machine cannot run kernel %s; it has: %s", kernel->name, available.c_str());
-    fail("usage.kernel", "unknown kernel \"%s\"; this machine has: %s (or auto)", name.c_str(), available.c_str());
-}
-
-// Scratch floats on cache lines: a vector load that straddles two lines costs two.
-struct alignas(64) Line {
-    float value[16];
-};
-inline size_t lines_for(size_t floats) { return (floats + 15) / 16; }
-
-// Threads, kernel and scratch memory: what every operation below needs in order to run.
-struct Compute {
-    static constexpr int block_tiles = 8;  // tiles of rows of A that a task packs: they stay in a core's second cache
-    const Kernel& kernel;
-    Threads threads;
-    std::vector<Line> packed_b;               // one sum block of B, in panels of tile_columns
-    std::vector<std::vector<Line>> packed_a;  // one per worker
-    Compute(const Kernel& chosen, int thread_count)
-        : kernel(chosen),
-          threads(thread_count),
-          packed_a(static_cast<size_t>(thread_count),
-                   std::vector<Line>(lines_for(static_cast<size_t>(block_tiles * chosen.tile_rows * sum_block)))) {}
-};
-
 // to[j * to_stride + i] = from[i * from_stride + j] for i, j < 4.
-inline void turn_4x4(float* to, int to_stride, const float* from, int from_stride) {
+ALWAYS_INLINE void turn_4x4(float* to, int to_stride, const float* from, int from_stride) {
     typedef Float4 Unaligned __attribute__((aligned(4), may_alias));
     Float4 row[4];
     for (ptrdiff_t i = 0; i < 4; ++i) row[i] = *reinterpret_cast<const Unaligned*>(from + i * from_stride);
@@ -457,60 +427,364 @@ inline void turn_4x4(float* to, int to_stride, const float* from, int from_strid
     for (ptrdiff_t j = 0; j < 4; ++j) *reinterpret_cast<Unaligned*>(to + j * to_stride) = column[j];
 }
 
-// Copies `used` lines of `depth` elements into a panel [depth, width], filling up with zeros; element (k, w) of the
-// panel comes from view(k, w) offset by (first_k, first_w).
-inline void pack_panel(float* panel, View<const float> view, int first_k, int first_w, int depth, int used, int width) {
+// PackFunction for floats: the panel is [depth, width].
+template <int Width>
+void pack_floats(void* to, View<const float> view, int first_k, int first_w, int depth, int used) {
+    float* const panel = static_cast<float*>(to);
     if (!view.transposed) {  // the lines lie side by side: copy along them
         for (int k = 0; k < depth; ++k) {
             const float* line = &view(first_k + k, first_w);
-            for (int w = 0; w < used; ++w) panel[k * width + w] = line[w];  // a few dozen: no call to memcpy
-            for (int w = used; w < width; ++w) panel[k * width + w] = 0;
+            for (int w = 0; w < used; ++w) panel[k * Width + w] = line[w];  // a few dozen: no call to memcpy
+            for (int w = used; w < Width; ++w) panel[k * Width + w] = 0;
         }
         return;
     }
     for (int w = 0; w < used; w += 4) {  // the lines lie along k: turn blocks of 4 x 4
         const int lines = std::min(4, used - w), whole = lines == 4 ? depth / 4 * 4 : 0;
         for (int k = 0; k < whole; k += 4)
-            turn_4x4(panel + k * width + w, width, &view(first_k + k, first_w + w), view.stride);
+            turn_4x4(panel + k * Width + w, Width, &view(first_k + k, first_w + w), view.stride);
         for (int i = 0; i < lines; ++i) {
             const float* line = &view(first_k, first_w + w + i);
-            for (int k = whole; k < depth; ++k) panel[k * width + w + i] = line[k];
+            for (int k = whole; k < depth; ++k) panel[k * Width + w + i] = line[k];
         }
     }
-    for (int k = 0; used < width && k < depth; ++k)
-        for (int w = used; w < width; ++w) panel[k * width + w] = 0;
+    for (int k = 0; used < Width && k < depth; ++k)
+        for (int w = used; w < Width; ++w) panel[k * Width + w] = 0;
 }
+
+// A kernel for each instruction set: the same body, another vector, compiled for its own target.
+#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                               \
+    TARGET inline void tile_##NAME(float* c, int c_stride, const void* a, const void* b, int b_stride, int depth,   \
+                                   int rows, int columns, bool add) {                                               \
+        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, static_cast<const float*>(a),                          \
+                                                static_cast<const float*>(b), b_stride, depth, rows, columns, add); \
+    }                                                                                                               \
+    inline const Kernel kernel_##NAME = vector_kernel<ROWS, VECTORS * sizeof(VECTOR) / sizeof(float)>(              \
+        #NAME, FUSED ? "fused" : "plain", [] { return static_cast<bool>(SUPPORTED); }, tile_##NAME);
+
+template <int Rows, int Columns>
+constexpr Kernel vector_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
+    const PackFunction pack_a = pack_floats<Rows>, pack_b = pack_floats<Columns>;
+    return {name, "fp32", arithmetic, 0, Rows, Columns, supported, pack_a, pack_b, tile, [](bool) {}};
+}
+
+// Panels of parts, for tiles of 32 x 32: for each 32 k and each part, twice (16 lines each) a matrix of 16 x 16 pairs
+// (k, k + 1): [line][pair] for A and [pair][line] for B, as AMX takes them.
+constexpr int part_lines = 32, part_size = 32 * part_lines;
+
+// Two times 16 floats to 16 pairs of parts, the parts of a pair `stride` elements apart. Interleaved: pair i is
+// (x[i], y[i]); else the pairs are (x[0], x[1]), ..., (y[14], y[15]).
+template <int Parts>
+ALWAYS_INLINE void split_pairs(uint16_t* to, const float* x, const float* y, ptrdiff_t stride, bool interleaved) {
+    typedef uint32_t Words __attribute__((vector_size(64)));
+    typedef uint16_t Halves __attribute__((vector_size(32)));
+    Float16 rest[2];
+    std::memcpy(&rest[0], x, sizeof rest[0]);
+    std::memcpy(&rest[1], y, sizeof rest[1]);
+#pragma GCC unroll 3
+    for (int part = 0; part < Parts; ++part, to += stride) {
+        Words top[2];
+        for (int i = 0; i < 2; ++i) {  // bf16_nearest
+            top[i] = Words(rest[i]) + (Words(rest[i]) >> 16 & 1) + 0x7FFF;
+            rest[i] -= Float16(top[i] & 0xFFFF0000);
+        }
+        const Words both = top[0] >> 16 | (top[1] & 0xFFFF0000);
+        const Halves halves[2] = {__builtin_convertvector(top[0] >> 16, Halves),
+                                  __builtin_convertvector(top[1] >> 16, Halves)};
+        std::memcpy(to, interleaved ? static_cast<const void*>(&both) : halves, sizeof both);
+    }
+}
+
+// PackFunction for parts. A row of 16 pairs comes from 32 k of a line, or from 16 lines of two k, as they lie in memory;
+// where the panel wants it the other way round, 16 x 16 pairs are turned.
+template <int Parts, bool OfB, bool AlongK>
+ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int first_k, int first_w, int depth,
+                                 int used) {
+    constexpr bool turn = AlongK == OfB;
+    alignas(64) uint16_t block[Parts * 512];
+    for (int k = 0; k < depth; k += 32, panel += Parts * part_size)
+        for (int w = 0; w < part_lines; w += 16) {
+            const bool whole = depth - k >= 32 && used - w >= 16;
+            for (int row = 0; row < 16; ++row) {
+                const int at_k = AlongK ? k : k + 2 * row, at_w = AlongK ? w + row : w;
+                float edge[32] = {};
+                const float *x = edge, *y = edge + 16;
+                if (whole) {
+                    x = &view(first_k + at_k, first_w + at_w);
+                    y = AlongK ? x + 16 : x + view.stride;
+                } else {
+                    for (int i = 0; i < 32; ++i) {
+                        const int some_k = AlongK ? k + i : at_k + i / 16, some_w = AlongK ? at_w : w + i % 16;
+                        if (some_k < depth && some_w < used) edge[i] = view(first_k + some_k, first_w + some_w);
+                    }
+                }
+                split_pairs<Parts>((turn ? block : panel + 32 * w) + 32 * row, x, y, turn ? 512 : part_size, !AlongK);
+            }
+            for (int part = 0; turn && part < Parts; ++part)
+                for (int i = 0; i < 16; i += 4)
+                    for (int j = 0; j < 16; j += 4)
+                        turn_4x4(reinterpret_cast<float*>(panel + part * part_size + 32 * w + 32 * j + 2 * i), 16,
+                                 reinterpret_cast<const float*>(block + part * 512 + 32 * i + 2 * j), 16);
+        }
+}
+
+template <int Parts, bool OfB>
+EACH_TARGET void pack_parts(void* panel, View<const float> view, int first_k, int first_w, int depth, int used) {
+    uint16_t* to = static_cast<uint16_t*>(panel);
+    if (view.transposed) return pack_parts_of<Parts, OfB, true>(to, view, first_k, first_w, depth, used);
+    pack_parts_of<Parts, OfB, false>(to, view, first_k, first_w, depth, used);
+}
+
+// What AMX does, in C++: quarters of a tile of C, [16, 16] each, and two tiles each of A and B. It is the definition's
+// inner loop (Intel's manual on TDPBF16PS; AMX takes subnormal numbers for zero).
+struct TilesInSoftware {
+    float c[4][256];
+    const uint16_t *a = nullptr, *b = nullptr;
+    static void prepare(bool) {}
+    void clear() { std::memset(c, 0, sizeof c); }
+    void load_c(const float* from, ptrdiff_t stride) {
+        for (int i = 0; i < 64; ++i)
+            std::memcpy(&c[i / 32 * 2 + i % 2][i % 32 / 2 * 16], from + i / 2 * stride + i % 2 * 16, 64);
+    }
+    void store_c(float* to, ptrdiff_t stride) const {
+        for (int i = 0; i < 64; ++i)
+            std::memcpy(to + i / 2 * stride + i % 2 * 16, &c[i / 32 * 2 + i % 2][i % 32 / 2 * 16], 64);
+    }
+    void load_a(const uint16_t* from) { a = from; }
+    void load_b(const uint16_t* from) { b = from; }
+    static float widened(uint16_t part) {
+        const uint32_t bits = uint32_t{part} << 16;
+        float x;
+        std::memcpy(&x, &bits, sizeof x);
+        return x;
+    }
+    void multiply() {
+        for (int quarter = 0; quarter < 4; ++quarter)
+            for (int row = 0; row < 16; ++row) {
+                const uint16_t *line = a + quarter / 2 * 512 + row * 32, *pairs = b + quarter % 2 * 512;
+                float even[16] = {}, odd[16] = {};
+                for (int pair = 0; pair < 16; ++pair, pairs += 32)
+                    for (int j = 0; j < 16; ++j) {
+                        even[j] += widened(line[2 * pair]) * widened(pairs[2 * j]);
+                        odd[j] += widened(line[2 * pair + 1]) * widened(pairs[2 * j + 1]);
+                    }
+                for (int j = 0; j < 16; ++j) c[quarter][row * 16 + j] += even[j] + odd[j];
+            }
+    }
+};
+
+#ifdef FUSED_KERNELS
+// The matrix unit itself. Every instruction says that it may read and write memory, so the compiler keeps their order.
+struct TilesInAmx {
+    static void prepare(bool begin) {
+        static constexpr struct alignas(64) {  // palette 1: all eight tiles have 16 rows of 64 bytes
+            uint8_t palette = 1, start_row = 0, reserved[14] = {};
+            uint16_t row_bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+            uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+        } shape;
+        if (begin)
+            asm volatile("ldtilecfg %0" ::"m"(shape) : "memory");
+        else
+            asm volatile("tilerelease" ::: "memory");
+    }
+    static void clear() {
+        asm volatile("tilezero %%tmm0\ntilezero %%tmm1\ntilezero %%tmm2\ntilezero %%tmm3" ::: "memory");
+    }
+    static void load_c(const float* from, ptrdiff_t stride) {
+        asm volatile(
+            "tileloadd (%0,%2,1), %%tmm0\ntileloadd 64(%0,%2,1), %%tmm1\n"
+            "tileloadd (%1,%2,1), %%tmm2\ntileloadd 64(%1,%2,1), %%tmm3" ::"r"(from),
+            "r"(from + 16 * stride), "r"(4 * stride)
+            : "memory");
+    }
+    static void store_c(float* to, ptrdiff_t stride) {
+        asm volatile(
+            "tilestored %%tmm0, (%0,%2,1)\ntilestored %%tmm1, 64(%0,%2,1)\n"
+            "tilestored %%tmm2, (%1,%2,1)\ntilestored %%tmm3, 64(%1,%2,1)" ::"r"(to),
+            "r"(to + 16 * stride), "r"(4 * stride)
+            : "memory");
+    }
+    static void load_a(const uint16_t* from) {
+        asm volatile("tileloadd (%0,%1,1), %%tmm4\ntileloadd 1024(%0,%1,1), %%tmm5" ::"r"(from), "r"(ptrdiff_t{64})
+                     : "memory");
+    }
+    static void load_b(const uint16_t* from) {
+        asm volatile("tileloadd (%0,%1,1), %%tmm6\ntileloadd 1024(%0,%1,1), %%tmm7" ::"r"(from), "r"(ptrdiff_t{64})
+                     : "memory");
+    }
+    static void multiply() {
+        asm volatile(
+            "tdpbf16ps %%tmm6, %%tmm4, %%tmm0\ntdpbf16ps %%tmm7, %%tmm4, %%tmm1\n"
+            "tdpbf16ps %%tmm6, %%tmm5, %%tmm2\ntdpbf16ps %%tmm7, %%tmm5, %%tmm3" ::
+                : "memory");
+    }
+};
+
+// Whether the processor has it, the kernel saves its registers, and lets this process use it (Linux: a request).
+inline bool amx_granted() {
+    static const bool granted = [] {
+        unsigned a, b, c, d, low, high;
+        if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (d >> 22 & 1) == 0 || (d >> 24 & 1) == 0) return false;
+        if (!__builtin_cpu_supports("avx512f")) return false;  // which also says that XGETBV is there
+        asm volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
+        constexpr int request_permission = 0x1023, tile_data = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+        if ((low >> 17 & 3) == 3 && syscall(SYS_arch_prctl, request_permission, tile_data) == 0) return true;
+        std::fprintf(stderr, "wodtem: the system does not grant the use of the matrix unit (AMX); going on without\n");
+        return false;
+    }();
+    return granted;
+}
+#endif
+
+template <class Tiles, int Parts>
+void tile_of_parts(float* c, int c_stride, const void* a_panel, const void* b_panel, int, int depth, int rows,
+                   int columns, bool add) {
+    const uint16_t *a = static_cast<const uint16_t*>(a_panel), *b = static_cast<const uint16_t*>(b_panel);
+    alignas(64) float whole[part_lines * part_lines];  // where the tile sticks out of C
+    const bool inside = rows == part_lines && columns == part_lines;
+    for (int row = 0; add && !inside && row < rows; ++row)
+        std::copy_n(c + static_cast<ptrdiff_t>(row) * c_stride, columns, whole + row * part_lines);
+    Tiles tiles;
+    if (add)
+        tiles.load_c(inside ? c : whole, inside ? c_stride : part_lines);
+    else
+        tiles.clear();
+    for (int k = 0; k < depth; k += 32, a += Parts * part_size, b += Parts * part_size)
+#pragma GCC unroll 3
+        for (int i = 0, loaded = -1; i < Parts; ++i) {
+            tiles.load_a(a + i * part_size);
+#pragma GCC unroll 3
+            for (int n = 0; n < Parts - i; ++n) {
+                const int j = part_of_b(Parts, i, n);
+                if (j != loaded) tiles.load_b(b + j * part_size);
+                loaded = j;
+                tiles.multiply();
+            }
+        }
+    tiles.store_c(inside ? c : whole, inside ? c_stride : part_lines);
+    for (int row = 0; !inside && row < rows; ++row)
+        std::copy_n(whole + row * part_lines, columns, c + static_cast<ptrdiff_t>(row) * c_stride);
+}
+
+template <class Tiles, int Parts>
+constexpr Kernel tile_kernel(const char* name, const char* precision, const char* arithmetic, bool (*supported)()) {
+    const PackFunction pack_a = pack_parts<Parts, false>, pack_b = pack_parts<Parts, true>;
+    const TileFunction tile = tile_of_parts<Tiles, Parts>;
+    return {name, precision, arithmetic, Parts, 32, 32, supported, pack_a, pack_b, tile, Tiles::prepare};
+}
+
+inline bool everywhere() { return true; }
+#define PARTS(NAME, TILES, FP32, SUPPORTED)                                                          \
+    inline const Kernel NAME##_bf16x6 = tile_kernel<TILES, 3>(#NAME, FP32, "bf16x6", SUPPORTED),     \
+                        NAME##_bf16x3 = tile_kernel<TILES, 2>(#NAME, "bf16x3", "bf16x3", SUPPORTED), \
+                        NAME##_bf16 = tile_kernel<TILES, 1>(#NAME, "bf16", "bf16", SUPPORTED);
+PARTS(portable, TilesInSoftware, "bf16x6", everywhere)
+#ifdef FUSED_KERNELS
+KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
+KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
+       __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+PARTS(amx, TilesInAmx, "fp32", amx_granted)
+#endif
+KERNEL(portable, , Float4, 4, 2, false, true)
+
+// Best first.
+inline const Kernel* const kernels[] = {
+#ifdef FUSED_KERNELS
+    &amx_bf16x6,      &amx_bf16x3,      &amx_bf16,        &kernel_avx512, &kernel_avx2,
+#endif
+    &kernel_portable, &portable_bf16x6, &portable_bf16x3, &portable_bf16};
+
+// By name ("auto": the best for the precision that is no imitation in software). Errors: usage.kernel, usage.precision.
+inline const Kernel& choose_kernel(const std::string& name, const std::string& precision = "fp32") {
+    std::string available;
+    bool named = name == "auto", precise = false;
+    for (const Kernel* kernel : kernels) {
+        const bool imitation = kernel->parts > 0 && std::strcmp(kernel->name, "portable") == 0,
+                   fits = precision == kernel->precision || precision == kernel->arithmetic;
+        named = named || name == kernel->name;
+        precise = precise || fits;
+        if (!kernel->supported()) continue;
+        if (fits && (name == kernel->name || (name == "auto" && !imitation))) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name + " " + kernel->precision;
+    }
+    if (!named)
+        fail("usage.kernel", "unknown kernel \"%s\"; this machine has: %s (or auto)", name.c_str(), available.c_str());
+    if (!precise)
+        fail("usage.precision", "unknown precision \"%s\"; this machine has: %s", precision.c_str(), available.c_str());
+    fail(name == "auto" ? "usage.precision" : "usage.kernel",
+         "this machine cannot compute in %s with kernel %s; it has: %s (portable imitates a matrix unit, slowly)",
+         precision.c_str(), name.c_str(), available.c_str());
+}
+
+// Scratch memory on cache lines: a vector load that straddles two lines costs two.
+struct alignas(64) Line {
+    char bytes[64];
+};
+inline size_t lines_for(size_t bytes) { return (bytes + 63) / 64; }
+
+// Threads, kernel and scratch memory: what every operation below needs in order to run.
+struct Compute {
+    static constexpr int block_tiles = 8;  // tiles of rows of A that a task packs: they stay in a core's second cache
+    const Kernel& kernel;
+    Threads threads;
+    std::vector<Line> packed_b;               // one sum block of B, in panels of tile_columns
+    std::vector<std::vector<Line>> packed_a;  // one per worker
+    Compute(const Kernel& chosen, int thread_count)
+        : kernel(chosen),
+          threads(thread_count),
+          packed_a(static_cast<size_t>(thread_count),
+                   std::vector<Line>(lines_for(chosen.panel_bytes(block_tiles * chosen.tile_rows, sum_block)))) {}
+};
 
 inline int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
 
-// The product of a block of rows with all panels of B, for one sum block.
-inline void matmul_rows(const Kernel& kernel, float* packed_a, View<float> c, View<const float> a, View<const float> b,
-                        const float* packed_b, int first_row, int rows, int first_column, int end_column, int first_k,
-                        int depth, bool add) {
+// Rows and columns of C that a task works on.
+struct Block {
+    int first_row, end_row, first_column, end_column;
+};
+
+// The product of a block of rows with panels of B, for one sum block.
+inline void matmul_block(const Kernel& kernel, char* packed_a, View<float> c, View<const float> a, View<const float> b,
+                         const char* packed_b, const Block& block, int first_k, int depth, bool add) {
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
-    for (int i = 0; i < rows; i += kernel.tile_rows)
-        pack_panel(packed_a + i * depth, a_lines, first_k, first_row + i, depth, std::min(kernel.tile_rows, rows - i),
-                   kernel.tile_rows);
-    for (int j = first_column; j < end_column; j += kernel.tile_columns) {
-        const float* panel = packed_b ? packed_b + static_cast<ptrdiff_t>(j) * depth : &b(first_k, j);
-        const int panel_stride = packed_b ? kernel.tile_columns : b.stride;
-        for (int i = 0; i < rows; i += kernel.tile_rows)
-            kernel.tile(&c(first_row + i, j), c.stride, packed_a + i * depth, panel, panel_stride, depth,
-                        std::min(kernel.tile_rows, rows - i), std::min(kernel.tile_columns, end_column - j), add);
+    const size_t a_panel = kernel.panel_bytes(kernel.tile_rows, depth),
+                 b_panel = kernel.panel_bytes(kernel.tile_columns, depth);
+    const auto tiles = [&](auto&& f) {  // f(panel of A, first row, rows)
+        char* panel = packed_a;
+        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows, panel += a_panel)
+            f(panel, i, std::min(kernel.tile_rows, block.end_row - i));
+    };
+    tiles([&](char* panel, int i, int rows) { kernel.pack_a(panel, a_lines, first_k, i, depth, rows); });
+    kernel.prepare(true);
+    for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns) {
+        const void* panel_b = &b(first_k, j);
+        if (packed_b) panel_b = packed_b + static_cast<size_t>(j / kernel.tile_columns) * b_panel;
+        tiles([&](char* panel, int i, int rows) {
+            kernel.tile(&c(i, j), c.stride, panel, panel_b, packed_b ? kernel.tile_columns : b.stride, depth, rows,
+                        std::min(kernel.tile_columns, block.end_column - j), add);
+        });
     }
+    kernel.prepare(false);
 }
 
-// The fast version of matmul_plain: same definition, panels packed for the kernel's tiles. A few rows (acting) read B
-// where it lies: packing it would cost as much as the product.
-inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
-                   Store store) {
+struct Nothing {
+    void operator()(const Block&) const {}
+};
+
+// The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles. A few
+// rows (acting) read B where it lies: packing it would cost as much as the product. before(block) and after(block) are
+// called for every part of C, before its first addition and after its last, while it is in a core's cache.
+template <class Before = Nothing, class After = Nothing>
+void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
+            Before before = {}, After after = {}) {
     if (M == 0 || N == 0) return;
     if (K == 0) {  // an empty sum
         for (int i = 0; store == Store::overwrite && i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
-        return;
+        before(Block{0, M, 0, N});
+        return after(Block{0, M, 0, N});
     }
     const Kernel& kernel = compute.kernel;
-    const bool pack_b = M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
+    const bool pack_b = kernel.parts > 0 || M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     const int threads = serial ? 1 : compute.threads.count();
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. Small enough for a fair share, no smaller.
@@ -519,10 +793,10 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, N / (4 * kernel.tile_columns)));
     const int block_columns = round_up((N + column_blocks - 1) / column_blocks, kernel.tile_columns);
     if (pack_b) {
-        const size_t lines = lines_for(static_cast<size_t>(round_up(N, kernel.tile_columns)) * sum_block);
+        const size_t lines = lines_for(kernel.panel_bytes(round_up(N, kernel.tile_columns), std::min(K, sum_block)));
         if (compute.packed_b.size() < lines) compute.packed_b.resize(lines);
     }
-    float* const packed_b = pack_b ? compute.packed_b[0].value : nullptr;
+    char* const packed_b = pack_b ? compute.packed_b[0].bytes : nullptr;
     const auto share_out = [&](int tasks, auto&& body) {
         if (threads == 1)
             for (int task = 0; task < tasks; ++task) body(task, 0);
@@ -536,24 +810,28 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
         if (pack_b)
             share_out((panels + panels_a_task - 1) / panels_a_task, [&](int task, int) {
                 for (int p = task * panels_a_task; p < std::min(panels, (task + 1) * panels_a_task); ++p)
-                    pack_panel(packed_b + static_cast<ptrdiff_t>(p) * kernel.tile_columns * depth, b, first_k,
-                               p * kernel.tile_columns, depth,
-                               std::min(kernel.tile_columns, N - p * kernel.tile_columns), kernel.tile_columns);
+                    kernel.pack_b(packed_b + static_cast<size_t>(p) * kernel.panel_bytes(kernel.tile_columns, depth), b,
+                                  first_k, p * kernel.tile_columns, depth,
+                                  std::min(kernel.tile_columns, N - p * kernel.tile_columns));
             });
         share_out(row_blocks * column_blocks, [&](int task, int worker) {
-            const int first_row = task / column_blocks * block_rows,
-                      first_column = task % column_blocks * block_columns;
-            matmul_rows(kernel, compute.packed_a[static_cast<size_t>(worker)][0].value, c, a, b, packed_b, first_row,
-                        std::min(block_rows, M - first_row), first_column, std::min(N, first_column + block_columns),
-                        first_k, depth, first_k > 0 || store == Store::accumulate);
+            const int row = task / column_blocks * block_rows, column = task % column_blocks * block_columns;
+            const Block block = {row, std::min(M, row + block_rows), column, std::min(N, column + block_columns)};
+            if (first_k == 0) before(block);
+            matmul_block(kernel, compute.packed_a[static_cast<size_t>(worker)][0].bytes, c, a, b, packed_b, block,
+                         first_k, depth, first_k > 0 || store == Store::accumulate);
+            if (first_k + depth == K) after(block);
         });
     }
 }
 
 // In double, for the gradient checks, the plain version is all there is.
-inline void matmul(Compute&, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
-                   Store store) {
+template <class Before = Nothing, class After = Nothing>
+void matmul(Compute&, View<double> c, View<const double> a, View<const double> b, int M, int N, int K, Store store,
+            Before before = {}, After after = {}) {
+    before(Block{0, M, 0, N});
     matmul_plain(c, a, b, M, N, K, store);
+    after(Block{0, M, 0, N});
 }
 
 // Sum of a[i] * b[i] in 16 lanes, folded in a fixed tree; faster than one chain of additions, and as reproducible.
@@ -728,20 +1006,59 @@ struct Affine {
     Layout layout;
 };
 
-// x [n, in] -> x W + b, columns [first, first + count) of it: y [n, count].
-template <class T>
-Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count) {
-    const Tensor<T> w = affine.weight, bias = affine.bias;
+// What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
+// columns [begin, end) of a row y of the result, backward(dy, y, row, begin, end) turns that row's gradient into the
+// sum's, in place.
+struct Identity {
+    template <class T>
+    void forward(T*, int, int, int) const {}
+    template <class T>
+    void backward(T*, const T*, int, int, int) const {}
+};
+
+// max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
+struct Relu {
+    template <class T>
+    void forward(T* y, int, int begin, int end) const {
+        for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
+    }
+    template <class T>
+    void backward(T* dy, const T* y, int, int begin, int end) const {
+        for (int j = begin; j < end; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
+    }
+};
+
+// finish(x W + b) of x [n, in], columns [first, first + count) of it: y [n, count].
+template <class T, class Finish = Identity>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count, Finish finish = {}) {
+    const Tensor<T> w = affine.weight, y = tape.make(x.rows, count);
+    const T* bias = affine.bias.value + first;
     const bool transposed = affine.layout == Layout::out_in;
     const ptrdiff_t offset = transposed ? static_cast<ptrdiff_t>(first) * w.columns : first;
-    const Tensor<T> y = tape.make(x.rows, count);
     Compute& compute = tape.compute;
-    for (ptrdiff_t row = 0; row < y.rows; ++row)
-        for (int j = 0; j < count; ++j) y.value[row * count + j] = bias.value[first + j];
+    const auto row_of = [count](T* data, int row) { return data + static_cast<ptrdiff_t>(row) * count; };
+    const auto begin_sums = [=](const Block& b) {
+        for (int row = b.first_row; row < b.end_row; ++row)
+            std::copy(bias + b.first_column, bias + b.end_column, row_of(y.value, row) + b.first_column);
+    };
+    const auto finish_sums = [=](const Block& b) {
+        for (int row = b.first_row; row < b.end_row; ++row)
+            finish.forward(row_of(y.value, row), row, b.first_column, b.end_column);
+    };
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed}, x.rows,
-           count, x.columns, Store::accumulate);
-    T *dw = tape.gradient(w) + offset, *db = tape.gradient(bias) + first;
+           count, x.columns, Store::accumulate, begin_sums, finish_sums);
+    T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
     tape.on_backward([=, &compute] {
+        constexpr int width = 64;  // columns at a time, row after row: finish's gradient and db in one pass
+        for_rows(compute, (count + width - 1) / width, y.rows * width * 4, [=](int begin, int end) {
+            for (int row = 0; row < y.rows; ++row)
+                for (int c = begin * width; c < std::min(count, end * width); c += width) {
+                    const int last = std::min(count, c + width);
+                    T* dy = row_of(y.gradient, row);
+                    finish.backward(dy, row_of(y.value, row), row, c, last);
+                    for (int j = c; j < last; ++j) db[j] += dy[j];
+                }
+        });
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
@@ -752,14 +1069,13 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         else  // dW += x^T dy
             matmul(compute, View<T>{dw, w.columns}, {x.value, x.columns, true}, dy, x.columns, count, x.rows,
                    Store::accumulate);
-        add_column_sums(compute, db, y.gradient, y.rows, count);
     });
     return y;
 }
 
-template <class T>
-Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine) {
-    return linear(tape, x, affine, 0, affine.bias.columns);
+template <class T, class Finish = Identity>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Finish finish = {}) {
+    return linear(tape, x, affine, 0, affine.bias.columns, finish);
 }
 
 // y [rows.size(), d] = the named rows of x [n, d]; a row may be named once at most.
@@ -781,9 +1097,10 @@ struct Norm {
     Tensor<T> weight, bias;  // [1, d]
 };
 
-// LayerNorm over the columns of x [n, d]: y = (x - mean) / sqrt(variance + 1e-5) * weight + bias, variance with 1/d.
-template <class T>
-Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
+// LayerNorm over the columns of x [n, d]: y = finish((x - mean) / sqrt(variance + 1e-5) * weight + bias), variance with
+// 1/d.
+template <class T, class Finish = Identity>
+Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish finish = {}) {
     const int d = x.columns;
     const Tensor<T> y = tape.make(x.rows, d), weight = norm.weight, bias = norm.bias;
     T* normalised = tape.template scratch<T>(x.size());                    // [n, d] (x - mean) / deviation
@@ -802,24 +1119,33 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
                 centred[j] /= deviation[row];
                 out[j] = centred[j] * weight.value[j] + bias.value[j];
             }
+            finish.forward(out, static_cast<int>(row), 0, d);
         }
     });
+    constexpr int block = 64;  // rows whose share of the gradients of weight and bias is added up by itself
+    const int blocks = (x.rows + block - 1) / block;
+    T* sums = tape.template scratch<T>(static_cast<size_t>(tape.recording ? blocks * 2 * d : 0));  // [2, blocks, d]
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward([=, &compute] {
         // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
-        T* g_all = y.value;  // the output is not needed any more: its memory serves
-        for_rows(compute, x.rows, 10 * d, [=](int begin, int end) {
-            for (ptrdiff_t row = begin; row < end; ++row) {
-                const T *dy = y.gradient + row * d, *n = normalised + row * d;
-                T *g = g_all + row * d, *dx = x.gradient + row * d;
-                for (int j = 0; j < d; ++j) g[j] = dy[j] * weight.value[j];
+        std::fill_n(sums, 2 * blocks * d, T(0));
+        for_rows(compute, blocks, 12 * block * d, [=](int begin, int end) {
+            for (ptrdiff_t row = begin * block; row < std::min(x.rows, end * block); ++row) {
+                const T* n = normalised + row * d;
+                T *dy = y.gradient + row * d, *g = y.value + row * d, *dx = x.gradient + row * d;  // y is done with
+                finish.backward(dy, g, static_cast<int>(row), 0, d);
+                T *d_w = sums + row / block * d, *d_b = d_w + static_cast<ptrdiff_t>(blocks) * d;
+                for (int j = 0; j < d; ++j) {
+                    g[j] = dy[j] * weight.value[j];
+                    d_w[j] += dy[j] * n[j];
+                    d_b[j] += dy[j];
+                }
                 const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
                 for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
-                for (int j = 0; j < d; ++j) g[j] = dy[j] * n[j];
             }
         });
-        add_column_sums(compute, d_weight, g_all, x.rows, d);
-        add_column_sums(compute, d_bias, y.gradient, x.rows, d);
+        add_column_sums(compute, d_weight, sums, blocks, d);
+        add_column_sums(compute, d_bias, sums + static_cast<ptrdiff_t>(blocks) * d, blocks, d);
     });
     return y;
 }
@@ -865,44 +1191,38 @@ Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
     return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
-// y = residual + dropout(x), or dropout(x) if residual is empty; all [n, d].
+// residual + dropout(y), or dropout(y) if the residual is empty.
 template <class T>
-Tensor<T> add_dropout(Tape<T>& tape, Tensor<T> residual, Tensor<T> x, Dropout dropout) {
-    const Tensor<T> y = tape.make(x.rows, x.columns);
-    const size_t d = static_cast<size_t>(x.columns);
-    Compute& compute = tape.compute;
-    const auto each_chunk = [=, &compute](auto&& f) {
-        for_rows(compute, x.rows, 16 * x.columns, [&](int begin, int end) {
-            dropout.each_chunk<T>(static_cast<size_t>(begin) * d, static_cast<size_t>(end) * d, f);
-        });
-    };
-    each_chunk([=](size_t first, size_t last, const T* factor) {
-        for (size_t i = first; i < last; ++i) y.value[i] = factor[i - first] * x.value[i];
-        for (size_t i = first; residual.value && i < last; ++i) y.value[i] += residual.value[i];
-    });
-    tape.on_backward([=] {
-        each_chunk([=](size_t first, size_t last, const T* factor) {
-            for (size_t i = first; i < last; ++i) x.gradient[i] += factor[i - first] * y.gradient[i];
-            for (size_t i = first; residual.value && i < last; ++i) residual.gradient[i] += y.gradient[i];
-        });
-    });
-    return y;
-}
+struct DropoutAdd {
+    Dropout dropout;
+    Tensor<T> residual;  // [n, d]
+    ptrdiff_t d;
 
-// x [n, d] = max(x, 0), in place: the product before needs its output no more. The slope at 0 is 0, as in PyTorch.
-template <class T>
-void relu(Tape<T>& tape, Tensor<T> x) {
-    Compute& compute = tape.compute;
-    const ptrdiff_t d = x.columns;
-    for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
-        for (ptrdiff_t i = begin * d; i < end * d; ++i) x.value[i] = x.value[i] < 0 ? T(0) : x.value[i];  // NaN stays
-    });
-    tape.on_backward([=, &compute] {
-        for_rows(compute, x.rows, x.columns, [=](int begin, int end) {
-            for (ptrdiff_t i = begin * d; i < end * d; ++i) x.gradient[i] = x.value[i] > 0 ? x.gradient[i] : T(0);
+    DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
+    void forward(T* y, int row, int begin, int end) const {
+        each_chunk(row, begin, end, [&](int first, int last, const T* factor) {
+            for (int j = first; j < last; ++j) y[j] *= factor[j - first];
         });
-    });
-}
+        for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
+    }
+    void backward(T* dy, const T*, int row, int begin, int end) const {
+        for (int j = begin; residual.value && j < end; ++j) residual.gradient[row * d + j] += dy[j];
+        each_chunk(row, begin, end, [&](int first, int last, const T* factor) {
+            for (int j = first; j < last; ++j) dy[j] *= factor[j - first];
+        });
+    }
+
+  private:
+    template <class F>
+    void each_chunk(int row, int begin, int end, F&& f) const {
+        if (dropout.probability == 0) return;
+        const size_t start = static_cast<size_t>(row * d);
+        dropout.each_chunk<T>(start + static_cast<size_t>(begin), start + static_cast<size_t>(end),
+                              [&](size_t first, size_t last, const T* factor) {
+                                  f(static_cast<int>(first - start), static_cast<int>(last - start), factor);
+                              });
+    }
+};
 
 // Causal attention, plain, one head: out [n, d] = softmax over keys j <= i of (q_i . k_j / sqrt(d)), times v_j.
 // q, k, v [n, d] of one sequence. The specification; `attention` below is held to it.
@@ -1308,11 +1628,11 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
     const Tensor<T> kv = linear(tape, h, block.c_attn, d, 2 * d);
     const Tensor<T> a = attention(tape, q, kv, keep(tape, spans), static_cast<int>(spans.size()), rows,
                                   model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
-    const Tensor<T> x1 = add_dropout(tape, all_ask ? x : select_rows(tape, x, rows, asked),
-                                     linear(tape, a, block.attn_proj), dropout_at(tape, dropout_site(layer, 1), p));
-    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc);
-    relu(tape, hidden);
-    return add_dropout(tape, x1, linear(tape, hidden, block.mlp_proj), dropout_at(tape, dropout_site(layer, 2), p));
+    const DropoutAdd<T> add_x(dropout_at(tape, dropout_site(layer, 1), p),
+                              all_ask ? x : select_rows(tape, x, rows, asked), d);
+    const Tensor<T> x1 = linear(tape, a, block.attn_proj, add_x);
+    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{});
+    return linear(tape, hidden, block.mlp_proj, DropoutAdd<T>(dropout_at(tape, dropout_site(layer, 2), p), x1, d));
 }
 
 // y = -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
@@ -1367,8 +1687,8 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
 template <class T>
 Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Ask ask) {
     const TokenLayout layout = token_layout(batch, ask);
-    Tensor<T> x = layer_norm(tape, embed_tokens(tape, model, batch, layout), model.embed_ln);
-    x = add_dropout(tape, {}, x, dropout_at(tape, 0, model.config.dropout));
+    Tensor<T> x = layer_norm(tape, embed_tokens(tape, model, batch, layout), model.embed_ln,
+                             DropoutAdd<T>(dropout_at(tape, 0, model.config.dropout), {}, model.config.width));
     for (int layer = 0; layer < model.config.layers; ++layer) {
         const bool last = layer + 1 == model.config.layers;
         x = transformer_block(tape, model, layer, x, last ? layout.asked : layout.all,
@@ -1541,25 +1861,27 @@ inline double warmup_factor(uint64_t update, uint64_t warmup_updates) {
     return update + 1 >= warmup_updates ? 1.0 : static_cast<double>(update + 1) / static_cast<double>(warmup_updates);
 }
 
-// Sum of squares in double: eight lanes within a block of 4096, the blocks (on all threads) added in order.
+// Sums of squares are taken in double: eight lanes within a block of 4096, the blocks added in order.
+constexpr size_t square_block = 4096;
+
 template <class T>
-double sum_of_squares(Compute& compute, const T* x, size_t n) {
-    constexpr size_t block = 4096;
-    std::vector<double> sums((n + block - 1) / block);
-    for_rows(compute, static_cast<int>(sums.size()), block, [&](int begin, int end) {
-        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b) {
-            double lane[8] = {};
-            const size_t last = std::min(n, (b + 1) * block);
-            size_t i = b * block;
-            for (; i + 8 <= last; i += 8)
-                for (size_t j = 0; j < 8; ++j) lane[j] += static_cast<double>(x[i + j]) * x[i + j];
-            for (; i < last; ++i) lane[0] += static_cast<double>(x[i]) * x[i];
-            for (const double part : lane) sums[b] += part;
-        }
+double block_of_squares(const T* x, size_t n) {
+    double lane[8] = {}, sum = 0;
+    size_t i = 0;
+    for (; i + 8 <= n; i += 8)
+        for (size_t j = 0; j < 8; ++j) lane[j] += static_cast<double>(x[i + j]) * x[i + j];
+    for (; i < n; ++i) lane[0] += static_cast<double>(x[i]) * x[i];
+    for (const double part : lane) sum += part;
+    return sum;
+}
+
+// f(block, first, count) for each block of [0, n), on all threads.
+template <class F>
+void for_blocks(Compute& compute, size_t n, int work, F&& f) {
+    for_rows(compute, static_cast<int>((n + square_block - 1) / square_block), work, [&](int begin, int end) {
+        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
+            f(b, b * square_block, std::min(n - b * square_block, square_block));
     });
-    double total = 0;
-    for (const double sum : sums) total += sum;
-    return total;
 }
 
 // x^n by squaring: libm's pow in double differs between processors.
@@ -1619,8 +1941,14 @@ void join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
 template <class T>
 double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
     double total = 0;
+    std::vector<double> sums;
     for (const Parameter<T>& parameter : parameters) {
-        const double squares = sum_of_squares(compute, parameter.gradient.data(), parameter.value.size());
+        const size_t n = parameter.value.size();
+        sums.assign((n + square_block - 1) / square_block, 0);
+        for_blocks(compute, n, square_block, [&](size_t block, size_t first, size_t count) {
+            sums[block] = block_of_squares(parameter.gradient.data() + first, count);
+        });
+        const double squares = std::accumulate(sums.begin(), sums.end(), 0.0);
         if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
         total += squares;
     }
@@ -1647,35 +1975,34 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         Parameter<float>& parameter = parameters[p];
         std::vector<float>&m = optimizer.first_moment[p], &v = optimizer.second_moment[p];
         const size_t n = parameter.value.size();
-        constexpr size_t block = 4096;
-        const int blocks = static_cast<int>((n + block - 1) / block);
         m.resize(n);
         v.resize(n);
-        for_rows(compute, blocks, 16 * block, [&](int begin, int end) {
-            const size_t first = static_cast<size_t>(begin) * block,
-                         count = std::min(n, static_cast<size_t>(end) * block) - first;
-            adam_step(parameter.gradient.data() + first, m.data() + first, v.data() + first,
-                      parameter.value.data() + first, count, config, scale, bias1, bias2);
+        const bool adapt = lamb && (config.weight_decay != 0 || config.always_adapt);
+        const size_t blocks = (n + square_block - 1) / square_block;
+        std::vector<double> value_squares(blocks), step_squares(blocks);
+        for_blocks(compute, n, 16 * square_block, [&](size_t block, size_t first, size_t count) {
+            float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
+            adam_step(step, m.data() + first, v.data() + first, value, count, config, scale, bias1, bias2);
+            if (adapt)
+                value_squares[block] = block_of_squares(value, count),
+                step_squares[block] = block_of_squares(step, count);
         });
         double trust = 1;
-        if (lamb && (config.weight_decay != 0 || config.always_adapt)) {
-            const double value_norm = std::sqrt(sum_of_squares(compute, parameter.value.data(), n));
-            const double step_norm = std::sqrt(sum_of_squares(compute, parameter.gradient.data(), n));
+        if (adapt) {
+            const double value_norm = std::sqrt(std::accumulate(value_squares.begin(), value_squares.end(), 0.0));
+            const double step_norm = std::sqrt(std::accumulate(step_squares.begin(), step_squares.end(), 0.0));
             if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
         }
         const float rate = static_cast<float>(learning_rate * trust);
         const float shrink =
             lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
-        std::vector<unsigned char> bad(static_cast<size_t>(blocks));
-        for_rows(compute, blocks, 4 * block, [&](int begin, int end) {
-            for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b) {
-                const size_t first = b * block;
-                bad[b] = !apply_step(parameter.value.data() + first, parameter.gradient.data() + first,
-                                     std::min(n - first, block), shrink, rate);
-            }
+        std::vector<unsigned char> bad(blocks);
+        for_blocks(compute, n, 4 * square_block, [&](size_t block, size_t first, size_t count) {
+            bad[block] =
+                !apply_step(parameter.value.data() + first, parameter.gradient.data() + first, count, shrink, rate);
         });
-        for (const unsigned char block_bad : bad)
-            if (block_bad) fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
+        if (std::count(bad.begin(), bad.end(), 1) > 0)
+            fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
     }
     return norm;
 }

@@ -90,7 +90,8 @@ inline const SettingRow setting_rows[] = {
     {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
     {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
     {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
-    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
+    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain|bf16x6|bf16x3|bf16",
+     "the kernel: multiply-add with one rounding or two, or sums of products of bf16 parts"},
     {"physics", &Settings::physics, 0, 0, "none|d4rl|2.2", "the task has no bodies"},
     {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
     {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
@@ -444,7 +445,7 @@ void require_same_settings(const Settings& found, const Settings& wanted, const 
         const bool kernel = std::string(row.name) == "arithmetic";
         fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
              row.name, was.c_str(), now.c_str(),
-             kernel ? "choose the kernel it was begun with (--kernel)"
+             kernel ? "choose the kernel and precision it was begun with (--kernel, --precision)"
                     : "choose another folder with --out, or the same settings");
     }
 }
@@ -1614,7 +1615,7 @@ struct FolderLock {
 };
 
 struct TrainOptions {
-    std::string kernel = "auto";
+    const Kernel& kernel;
     int threads = 1;
     double checkpoint_every = 30;
 };
@@ -1635,7 +1636,7 @@ void train_in(const Environment& environment, const Settings& settings, const st
         std::printf("%s is finished already\n", path.c_str());
         return;
     }
-    Compute compute(choose_kernel(options.kernel), options.threads);
+    Compute compute(options.kernel, options.threads);
     Run run(compute, settings, environment.spec());
     if (fs::exists(session.folder.file("checkpoint.safetensors"))) {
         load_checkpoint(run, session.folder);
@@ -1705,7 +1706,9 @@ const Option physics_option = {"--physics", "NAME", "",
 const Option set_option = {"--set", "NAME=VALUE", "",
                            "any setting (see `wodtem info` of a run's model); may be repeated"};
 const Option kernel_option = {"--kernel", "NAME", "auto",
-                              "matrix kernel: avx512, avx2, portable, or the best there is"};
+                              "matrix kernel: amx, avx512, avx2, portable, or the best there is"};
+const Option precision_option = {"--precision", "NAME", "fp32",
+                                 "of matrix products: fp32, bf16x3 (error 2^-16) or bf16 (2^-8)"};
 const Option threads_option = {"--threads", "N", "0", "worker threads; 0: one per core; results do not depend on it"};
 
 // Errors: usage.number.
@@ -1761,10 +1764,19 @@ void choose_data_set(Settings& settings, const std::string& given) {
     settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
 }
 
+// A choice by rule, so that a run's bits do not depend on a moment's load: where there is a matrix unit, it computes fp32
+// products as bf16x6, but for networks that would leave most of its 32 x 32 tiles empty.
+const Kernel& asked_kernel(const Arguments& arguments, const Settings& settings) {
+    const std::string name = arguments["--kernel"], precision = arguments["--precision"];
+    if (name == "auto" && precision == "fp32" && settings.width < 128)
+        for (const Kernel* kernel : kernels)
+            if (kernel->parts == 0 && kernel->supported()) return *kernel;
+    return choose_kernel(name, precision);
+}
+
 Settings asked_settings(const Arguments& arguments, int64_t seed) {
     Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
     settings.seed = seed;
-    settings.arithmetic = choose_kernel(arguments["--kernel"]).fused ? "fused" : "plain";
     if (settings.task != "gridworld") {
         settings.mujoco = mujoco_version();
         choose_data_set(settings, arguments["--dataset"]);
@@ -1784,6 +1796,7 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
         set_from(settings, name, assignment.substr(equals + 1), "command line");
     }
     check_together(settings);
+    settings.arithmetic = asked_kernel(arguments, settings).arithmetic;
     return settings;
 }
 
@@ -1799,11 +1812,8 @@ void command_train(const Arguments& arguments) {
             std::signal(number, SIG_DFL);  // a second one ends the process at once
         });
     }
-    TrainOptions options;
-    options.kernel = arguments["--kernel"];
-    options.threads = thread_count(arguments);
-    options.checkpoint_every =
-        static_cast<double>(whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400));
+    const int threads = thread_count(arguments);
+    const int64_t checkpoint_every = whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400);
     const bool several = !arguments["--seeds"].empty();
     if (several && !arguments["--seed"].empty()) fail("usage.option", "--seed and --seeds were both given; choose one");
     for (const int64_t seed : seed_list(several                       ? arguments["--seeds"]
@@ -1816,7 +1826,7 @@ void command_train(const Arguments& arguments) {
         for (const SettingRow& row : setting_rows)
             line += std::string(" ") + row.name + "=" + setting_text(settings, row);
         std::fprintf(stderr, "%s:%s\n", folder.c_str(), line.c_str());
-        train(settings, folder, options);
+        train(settings, folder, {asked_kernel(arguments, settings), threads, static_cast<double>(checkpoint_every)});
     }
 }
 
@@ -1839,7 +1849,7 @@ template <class Environment>
 void evaluate_model(const Environment& environment, const Settings& settings, const TensorFile& file,
                     const Arguments& arguments) {
     const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 10000));
-    Compute compute(choose_kernel(arguments["--kernel"]), thread_count(arguments));
+    Compute compute(asked_kernel(arguments, settings), thread_count(arguments));
     Run run(compute, settings, environment.spec());
     load_model(run, file);
     std::vector<Environment> environments(static_cast<size_t>(count), environment);
@@ -2158,7 +2168,7 @@ void command_tasks(const Arguments& arguments) {
 #include "tests/bench.hpp"
 
 void command_bench(const Arguments& arguments) {
-    const Kernel& chosen = choose_kernel(arguments["--kernel"]);
+    choose_kernel(arguments["--kernel"]);  // refuses what the machine lacks
     const int threads = thread_count(arguments);
     const std::string what = arguments.words.empty() ? "updates" : arguments.words[0];
     if (what != "updates" && what != "environments" && what != "random-policy")
@@ -2174,12 +2184,7 @@ void command_bench(const Arguments& arguments) {
         fail("mujoco.absent", "MuJoCo 2.2 was not there when this program was built; %s", mujoco_advice);
 #endif
     }
-    std::printf("medians and ranges; a product's share is of the peak measured just before and after it\n");
-    for (const Kernel* kernel : kernels)
-        if (kernel->supported() && (arguments["--kernel"] == "auto" || kernel == &chosen)) bench_products(*kernel);
-    std::printf("%s:\n", chosen.name);
-    bench_updates(chosen, threads);
-    for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(entries);
+    bench_all(arguments["--kernel"], threads, !arguments["--json"].empty());
 }
 
 const std::vector<Command>& commands() {
@@ -2198,6 +2203,7 @@ const std::vector<Command>& commands() {
           {"--dataset", "FILE", "", "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
           {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
           kernel_option,
+          precision_option,
           threads_option,
           {"--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"}},
          command_train},
@@ -2206,7 +2212,7 @@ const std::vector<Command>& commands() {
          1,
          1,
          "evaluate a saved model; needs nothing else",
-         {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option},
+         {{"--episodes", "N", "1", "episodes"}, kernel_option, precision_option, threads_option},
          command_eval},
         {"collect",
          "ID",
@@ -2253,7 +2259,7 @@ const std::vector<Command>& commands() {
          0,
          1,
          "updates: kernels beside the machine's peak, look-ups; environments: steps a second; random-policy",
-         {kernel_option, threads_option},
+         {kernel_option, threads_option, {"--json", nullptr, "", "of updates: print one JSON array"}},
          command_bench},
         {"tasks",
          "[TASK]",

@@ -1,6 +1,7 @@
-// bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's fp32 peak with
-// registers alone, each kernel's share of it at the shapes that training uses, one update, one memory look-up.
-// Medians and ranges; a machine's clock moves with its neighbours, so figures of different runs do not compare.
+// bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's peaks first, then
+// each kernel's share of them at the shapes that training uses, the update of both networks in every precision that the
+// machine has, look-ups, acting. Medians and ranges; a machine's clock moves with its neighbours, so figures of different
+// runs do not compare.
 // Included by wodtem.cpp, after training. Leaves out: judging; a test never looks at a clock.
 #pragma once
 
@@ -13,66 +14,262 @@ double seconds_of(const std::function<void()>& work) {
 }
 
 struct Spread {
-    double low, median, high;
+    double low = 0, median = 0, high = 0;
 };
 
-// Of `rounds` runs, after one that does not count.
+Spread spread_of(std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    return {values.front(), values[values.size() / 2], values.back()};
+}
+
+// Seconds of `rounds` runs, after one that does not count.
 Spread timed(int rounds, const std::function<void()>& work) {
     work();
     std::vector<double> seconds;
     for (int round = 0; round < rounds; ++round) seconds.push_back(seconds_of(work));
-    std::sort(seconds.begin(), seconds.end());
-    return {seconds.front(), seconds[seconds.size() / 2], seconds.back()};
+    return spread_of(seconds);
 }
 
-// The shapes of the paper's grid-world network at batch 256, and of a gym network's layer on 1024 tokens.
-void bench_products(const Kernel& kernel) {
-    Compute compute(kernel, 1);
+// One measurement. The counts are what the task cannot do without; a share is of the peak of its own moment.
+struct Measurement {
+    std::string group, name;
+    Spread seconds;                    // of one
+    double operations = 0, bytes = 0;  // 2 a multiply-add; between core and memory; 0: not counted
+    Spread share = {};                 // of the peak, in percent; 0: not compared
+};
+
+struct Measurements {
+    bool json;
+    std::vector<Measurement> all;
+
+    void add(Measurement one) {
+        if (!json) print(one, all.empty() || all.back().group != one.group);
+        all.push_back(std::move(one));
+    }
+
+    static void print(const Measurement& f, bool first) {
+        if (first) std::printf("%s\n", f.group.c_str());
+        const double s = f.seconds.median, unit = s < 1e-4 ? 1e6 : s < 1 ? 1e3 : 1;
+        std::printf("  %-44s %8.3f %s (%.3f to %.3f)", f.name.c_str(), s * unit,
+                    unit > 1e3 ? "us"
+                    : unit > 1 ? "ms"
+                               : "s ",
+                    f.seconds.low * unit, f.seconds.high * unit);
+        if (f.operations > 0) std::printf("  %7.1f GFLOP/s", f.operations / s / 1e9);
+        if (f.bytes > 0) std::printf("  %6.1f GB/s", f.bytes / s / 1e9);
+        if (f.share.median > 0) std::printf("  %3.0f%% (%.0f to %.0f)", f.share.median, f.share.low, f.share.high);
+        std::printf("\n");
+        std::fflush(stdout);
+    }
+
+    void print_json() const {
+        const auto text = [](const Spread& x) {
+            return "[" + number_text(x.low) + ", " + number_text(x.median) + ", " + number_text(x.high) + "]";
+        };
+        std::printf("[");
+        for (const Measurement& f : all)
+            std::printf(
+                "%s\n  {\"group\": \"%s\", \"name\": \"%s\", \"seconds\": %s, \"operations\": %s, \"bytes\": %s, "
+                "\"share_percent\": %s}",
+                &f == &all[0] ? "" : ",", f.group.c_str(), f.name.c_str(), text(f.seconds).c_str(),
+                number_text(f.operations).c_str(), number_text(f.bytes).c_str(), text(f.share).c_str());
+        std::printf("\n]\n");
+    }
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Peaks: arithmetic in registers alone, and memory read from end to end.
+
+constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
+
+template <class Vector, bool Fused>
+ALWAYS_INLINE float burn_vectors(int64_t rounds) {
+    Vector sum[burn_chains], a = 0.999f - Vector{}, b = 0.001f - Vector{};
+#pragma GCC unroll 16
+    for (int i = 0; i < burn_chains; ++i) sum[i] = Vector{};
+    for (int64_t round = 0; round < rounds; ++round) {
+#pragma GCC unroll 16
+        for (int i = 0; i < burn_chains; ++i) {
+            if constexpr (Fused)
+                multiply_add<true>(sum[i], a, b);
+            else
+                sum[i] = sum[i] * a + b;
+        }
+#if defined(__x86_64__)
+        asm volatile("" : "+v"(a));  // a might have changed: no product may leave the loop
+#endif
+    }
+    Vector total = sum[0];
+#pragma GCC unroll 16
+    for (int i = 1; i < burn_chains; ++i) total += sum[i];
+    return total[0];
+}
+
+template <class Tiles>
+float burn_tiles(int64_t rounds) {
+    alignas(64) static const uint16_t zeros[part_size] = {};
+    alignas(64) float c[part_size];
+    Tiles tiles;
+    Tiles::prepare(true);
+    tiles.clear();
+    tiles.load_a(zeros);
+    tiles.load_b(zeros);
+    for (int64_t round = 0; round < rounds; ++round) tiles.multiply();
+    tiles.store_c(c, part_lines);
+    Tiles::prepare(false);
+    return c[0];
+}
+
+#ifdef FUSED_KERNELS
+__attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) { return burn_vectors<Float16, true>(rounds); }
+__attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) { return burn_vectors<Float8, true>(rounds); }
+#endif
+
+// Operations a second of one core's unit, in its own products: a float product of `parts` is several of them.
+double burn_rate(const Kernel& kernel) {
+    float (*burn)(int64_t) = kernel.parts > 0 ? burn_tiles<TilesInSoftware> : burn_vectors<Float4, false>;
+    double operations = kernel.parts > 0 ? 2.0 * 32 * 32 * 32 : 2.0 * burn_chains * kernel.tile_columns / 2;
+#ifdef FUSED_KERNELS
+    if (&kernel == &kernel_avx512) burn = burn_avx512;
+    if (&kernel == &kernel_avx2) burn = burn_avx2;
+    if (kernel.supported == amx_granted) burn = burn_tiles<TilesInAmx>;
+#endif
     volatile float sink = 0;
-    const double burn_count = 3e8;  // operations: a few milliseconds
-    const auto burn_rate = [&] {
-        return burn_count /
-               seconds_of([&] { sink = sink + kernel.burn(static_cast<int64_t>(burn_count / burn_flops(kernel))); }) /
-               1e9;
-    };
-    burn_rate();
-    double peak = 0;
-    for (int round = 0; round < 20; ++round) peak = std::max(peak, burn_rate());
-    std::printf("%s: fp32 peak of one core %.1f GFLOP/s (registers only)\n", kernel.name, peak);
-    struct Case {
-        const char* what;
-        int M, N, K;
-        bool a_transposed, b_transposed;
-    };
-    for (const Case& s :
-         {Case{"keys, values", 512, 1024, 512, false, false}, Case{"attention out", 256, 512, 512, false, false},
-          Case{"MLP in", 256, 2048, 512, false, false}, Case{"MLP out", 256, 512, 2048, false, false},
-          Case{"MLP in, d input", 256, 512, 2048, false, true}, Case{"MLP in, d weight", 512, 2048, 256, true, false},
-          Case{"gym MLP in", 1024, 2048, 512, false, false}, Case{"small MLP in", 256, 64, 16, false, false}}) {
+    const double rounds = std::max(1.0, (kernel.supported == everywhere && kernel.parts > 0 ? 1e7 : 3e8) / operations);
+    const double seconds = seconds_of([&] { sink = sink + burn(static_cast<int64_t>(rounds)); });
+    return operations * rounds / seconds;
+}
+
+int products_of_parts(const Kernel& kernel) { return kernel.parts > 0 ? kernel.parts * (kernel.parts + 1) / 2 : 1; }
+
+std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic; }
+
+// Bytes a second that `threads` read from memory beyond any cache.
+double bench_memory_bandwidth(Measurements& measured, int threads) {
+    const size_t count = size_t{1} << 26;  // 256 MB
+    const std::vector<float> x(count, 1.0f);
+    Threads workers(threads);
+    std::vector<float> sums(64);
+    const Spread time = timed(5, [&] {
+        workers.run(64, [&](int task, int) {
+            const size_t share = count / 64;
+            std::vector<float> ones(4096, 1.0f);
+            for (size_t i = 0; i < share; i += 4096)
+                sums[static_cast<size_t>(task)] += dot(&x[static_cast<size_t>(task) * share + i], ones.data(), 4096);
+        });
+    });
+    const double bytes = static_cast<double>(count * sizeof(float));
+    measured.add({"peaks", "memory read, " + std::to_string(threads) + " threads", time, 0, bytes});
+    return bytes / time.median;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Kernels.
+
+struct Shape2 {
+    const char* what;
+    int M, N, K;
+    bool a_transposed, b_transposed;
+};
+
+// The shapes of the paper's grid-world network at batch 256, of a gym network's MLP on 2048 tokens, and of a small one.
+constexpr Shape2 product_shapes[] = {
+    {"keys, values", 512, 1024, 512, false, false},
+    {"attention out", 256, 512, 512, false, false},
+    {"MLP in", 256, 2048, 512, false, false},
+    {"MLP out", 256, 512, 2048, false, false},
+    {"MLP in, d input", 256, 512, 2048, false, true},
+    {"MLP in, d weight", 512, 2048, 256, true, false},
+    {"small MLP in", 256, 64, 16, false, false},
+    {"gym MLP in", 2048, 2048, 512, false, false},
+    {"gym MLP in, d input", 2048, 512, 2048, false, true},
+    {"gym MLP in, d weight", 512, 2048, 2048, true, false},
+};
+
+// Returns the mean rate at the gym network's shapes, operations a second.
+double bench_products(Measurements& measured, const Kernel& kernel, int threads) {
+    Compute compute(kernel, threads);
+    const double products = products_of_parts(kernel);
+    const std::string group =
+        "products, " + label(kernel) + ", " + std::to_string(threads) + " threads; share of the peak";
+    double gym_operations = 0, gym_seconds = 0;
+    for (const Shape2& s : product_shapes) {
         const auto size = [](int rows, int columns) {
             return static_cast<size_t>(rows) * static_cast<size_t>(columns);
         };
         const std::vector<float> a(size(s.M, s.K), 0.5f), b(size(s.K, s.N), 0.25f);
         std::vector<float> c(size(s.M, s.N));
-        const double flops = 2.0 * s.M * s.N * s.K;
-        const int repeats = std::max(1, static_cast<int>(5e8 / flops));
+        const double operations = 2.0 * s.M * s.N * s.K;
+        const int repeats = std::max(1, static_cast<int>(5e8 / operations));
         const auto multiply = [&] {
             for (int i = 0; i < repeats; ++i)
                 matmul(compute, View<float>{c.data(), s.N}, {a.data(), s.a_transposed ? s.M : s.K, s.a_transposed},
                        {b.data(), s.b_transposed ? s.K : s.N, s.b_transposed}, s.M, s.N, s.K, Store::overwrite);
         };
         multiply();
-        std::vector<double> rates, shares;  // each beside the peak of its own moment: neighbours come and go
-        for (int round = 0; round < 15; ++round) {
-            const double before = burn_rate(), rate = flops * repeats / seconds_of(multiply) / 1e9;
-            rates.push_back(rate);
-            shares.push_back(100 * rate / std::max(before, burn_rate()));
+        std::vector<double> seconds, shares;  // each beside the peak of its own moment: neighbours come and go
+        for (int round = 0; round < 9; ++round) {
+            const double before = burn_rate(kernel), time = seconds_of(multiply) / repeats;
+            seconds.push_back(time);
+            shares.push_back(100 * products * operations / time / threads / std::max(before, burn_rate(kernel)));
         }
-        std::sort(rates.begin(), rates.end());
-        std::sort(shares.begin(), shares.end());
-        std::printf("  %-18s %5d x %4d x %4d  %7.1f GFLOP/s  %3.0f%% of peak  (%.0f%% to %.0f%%)\n", s.what, s.M, s.N,
-                    s.K, rates[7], shares[7], shares.front(), shares.back());
+        char name[80];
+        std::snprintf(name, sizeof name, "%-20s %5d x %4d x %4d", s.what, s.M, s.N, s.K);
+        measured.add({group, name, spread_of(seconds), operations, 0, spread_of(shares)});
+        if (std::string(s.what).starts_with("gym")) {
+            gym_operations += operations;
+            gym_seconds += spread_of(seconds).median;
+        }
     }
+    return gym_operations / gym_seconds;
+}
+
+// What else an update of the gym network does, on a part of 2048 tokens; the optimiser on all its weights. Share of the
+// memory's speed.
+void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threads, double bandwidth) {
+    Compute compute(kernel, threads);
+    Tape<float> tape(compute);
+    constexpr int tokens = 59 * 34, d = 512, windows = 34;
+    const std::string group = "other kernels, " + std::to_string(threads) + " threads; share of the memory's speed";
+    const double row_bytes = 4.0 * tokens * d;
+    const auto add = [&](const char* name, const Spread& time, double operations, double bytes) {
+        const auto share = [&](double seconds) { return 100 * bytes / seconds / bandwidth; };
+        measured.add({group, name, time, operations, bytes, {share(time.high), share(time.median), share(time.low)}});
+    };
+    Parameter<float> weight{"", {d}, std::vector<float>(d, 1.0f), std::vector<float>(d)}, bias = weight;
+    std::vector<float> values(static_cast<size_t>(tokens) * d * 3, 0.5f), gradients(values.size());
+    const auto tensor = [&](int columns) { return Tensor<float>{values.data(), gradients.data(), tokens, columns}; };
+    const std::vector<float> coefficients(tokens, 1.0f);
+    Tensor<float> y;
+    const auto backward = [&] {
+        std::fill_n(y.gradient, y.size(), 1e-3f);
+        const Tensor<float> one = tape.make(1, 1);
+        tape.backward(one);
+    };
+    const Spread norm = timed(9, [&] {
+        tape.reset();
+        y = layer_norm(tape, tensor(d), {weight.tensor(), bias.tensor()});
+        backward();
+    });
+    add("LayerNorm, forward and backward", norm, 0, 7 * row_bytes);  // x, y; dy, x, dx twice, y
+    std::vector<Span> spans;
+    std::vector<int> position;
+    for (int i = 0; i < windows; ++i) spans.push_back({59 * i, 59, 59 * i, 59});
+    for (int i = 0; i < tokens; ++i) position.push_back(i);
+    const Spread attend = timed(9, [&] {
+        tape.reset();
+        const Tensor<float> q = tensor(d), kv = {values.data(), gradients.data(), tokens, 2 * d};
+        y = attention(tape, q, kv, spans.data(), windows, position.data(), 4, dropout_at(tape, 0, 0.1f));
+        backward();
+    });
+    add("attention, 4 heads, forward and backward", attend, 7 * 2.0 * tokens * 30 * d, 11 * row_bytes);
+    std::vector<Parameter<float>> parameters(1);
+    parameters[0] = {"", {4096, 3072}, std::vector<float>(4096 * 3072, 0.01f), std::vector<float>(4096 * 3072, 1e-3f)};
+    Optimizer optimizer;
+    OptimizerConfig config;
+    config.weight_decay = 5e-4;
+    const Spread step = timed(5, [&] { update_parameters(compute, parameters, optimizer, config); });
+    add("LAMB, 12.6 million weights", step, 0, 4.0 * 4096 * 3072 * 8);  // read g, m, v, x; write m, v, x, g
 }
 
 // Arithmetic of one update that the action prediction needs (2 a multiply-add; forward, and twice that backward), with
@@ -87,43 +284,65 @@ double update_flops(const Settings& settings) {
 }
 
 template <class Environment>
-void bench_update(const Kernel& kernel, int threads, const char* what, const Settings& settings,
-                  const Environment& environment) {
+void bench_update(Measurements& measured, const Kernel& kernel, int threads, double products_rate, const char* what,
+                  const Settings& settings, const Environment& environment) {
     Compute compute(kernel, threads);
     Run run(compute, settings, environment.spec());
     begin_run(run, make_data_set(settings, environment));
-    const int repeats = std::max(1, static_cast<int>(1e9 / update_flops(settings)));
-    const Spread time = timed(update_flops(settings) > 1e11 ? 3 : 7, [&] {
-        for (int i = 0; i < repeats; ++i) update(run);
-    });
-    std::printf("  WODTEM update, %-28s %d thread%s %9.3f ms (%.3f to %.3f)  %6.1f GFLOP/s of %.4g GFLOP\n", what,
-                threads, threads == 1 ? " " : "s", time.median / repeats * 1e3, time.low / repeats * 1e3,
-                time.high / repeats * 1e3, update_flops(settings) * repeats / time.median / 1e9,
-                update_flops(settings) / 1e9);
+    const double operations = update_flops(settings);
+    const int repeats = std::max(1, static_cast<int>(1e9 / operations));
+    std::vector<double> seconds, shares;
+    update(run);
+    for (int round = 0; round < (operations > 1e11 ? 3 : 7); ++round) {
+        seconds.push_back(seconds_of([&] {
+                              for (int i = 0; i < repeats; ++i) update(run);
+                          }) /
+                          repeats);
+        shares.push_back(100 * operations / seconds.back() / products_rate);
+    }
+    measured.add({"updates; share of the products' own rate at the gym network's shapes",
+                  std::string(what) + ", " + label(kernel) + ", " + std::to_string(threads) + " threads",
+                  spread_of(seconds), operations, 0, spread_of(shares)});
+    if (settings.context_length == 1) return;
+    // Acting: the network's part of a step, at full windows.
+    for (const size_t episodes : {size_t{1}, size_t{10}}) {
+        std::vector<Episode> playing(episodes);
+        for (Episode& episode : playing) {
+            episode.trajectory = run.replay.trajectories[0];
+            const size_t steps = static_cast<size_t>(episode.trajectory.length());
+            episode.returns_to_go.assign(steps + 1, 1.0f);
+            episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
+        }
+        const SequenceBatch batch = acting_batch(run.agent, playing);
+        const Spread time = timed(9, [&] {
+            run.acting.reset();
+            forward(run.acting, run.agent.model, batch, Ask::last_state);
+        });
+        const double d = static_cast<double>(settings.width),
+                     tokens = 3.0 * static_cast<double>(settings.context_length) - 1,
+                     layers = static_cast<double>(settings.layers);
+        measured.add({"acting, one step of the gym network at full windows",
+                      std::to_string(episodes) + " episodes, " + label(kernel), time,
+                      2 * static_cast<double>(episodes) *
+                          ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d)});
+    }
 }
 
-void bench_updates(const Kernel& kernel, int threads) {
-    for (int count = 1; count <= threads; count *= 2) {
-        for (const char* preset : {"small", "paper"}) {
-            const Settings settings = default_settings("gridworld", "wodtem", preset);
-            bench_update(kernel, count,
-                         std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
-                         settings, GridWorld{});
-        }
+void bench_updates(Measurements& measured, const Kernel& kernel, int threads, double products_rate) {
+    for (const char* preset : {"small", "paper"})
+        bench_update(measured, kernel, threads, products_rate,
+                     std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
+                     default_settings("gridworld", "wodtem", preset), GridWorld{});
 #ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
-        Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
-        set_setting(gym, "behaviour", "random");
-        bench_update(kernel, count, "halfcheetah, preset paper", gym,
-                     MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
+    Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
+    set_setting(gym, "behaviour", "random");
+    bench_update(measured, kernel, threads, products_rate, "halfcheetah, preset paper", gym,
+                 MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
 #endif
-    }
-    rusage use{};
-    getrusage(RUSAGE_SELF, &use);
-    std::printf("  peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
 }
 
 // Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
-void bench_memory(size_t entries) {
+void bench_memory(Measurements& measured, size_t entries) {
     constexpr size_t queries = 5000, arrivals = 1000, rounds = 15;
     MemoryConfig config{};
     config.state_dim = config.projected_dim = 4;
@@ -154,21 +373,54 @@ void bench_memory(size_t entries) {
         asked[4 * i] += 0.01f;
     }
     const float* ask = asked.data();
-    const Spread time = timed(39, [&] {
+    const Spread look_up = timed(39, [&] {
         const Neighbourhoods found = memory.search(ask, queries);
         for (size_t i = 0; i < queries; ++i) memory.count_accesses(found[i]);
         ask += 4 * queries;
     });
-    const auto print = [](const char* what, const Spread& spread, double n) {
-        std::printf("    %-42s %.3f us (%.3f to %.3f)\n", what, spread.median / n * 1e6, spread.low / n * 1e6,
-                    spread.high / n * 1e6);
+    const std::string group = "memory, " + std::to_string(entries) + " entries in 4 dimensions, K = 2, one core";
+    const auto add = [&](const char* what, Spread spread, double n) {
+        measured.add({group, what, {spread.low / n, spread.median / n, spread.high / n}});
     };
-    std::printf(
-        "  memory, %zu entries in 4 dimensions, K = 2, one core: filled in %.2f s, tree built in %.2f s, %.0f bytes an entry\n",
-        entries, insertion, build, static_cast<double>(memory.bytes()) / static_cast<double>(memory.size()));
-    print("look-up, 5000 at once", time, queries);
-    print("insertion, 1000 in a row", arrival, arrivals);
-    print("insertion and eviction, 1000 in a row", exchange, arrivals);
+    add("look-up, 5000 at once", look_up, queries);
+    add("insertion, 1000 in a row", arrival, arrivals);
+    add("insertion and eviction, 1000 in a row", exchange, arrivals);
+    add("filling, an entry", {insertion, insertion, insertion}, static_cast<double>(entries));
+    add("building the tree, all", {build, build, build}, 1);
+    if (!measured.json)
+        std::printf("  %.0f bytes an entry\n",
+                    static_cast<double>(memory.bytes()) / static_cast<double>(memory.size()));
+}
+
+void bench_all(const std::string& kernel_name, int threads, bool json) {
+    Measurements measured{json, {}};
+    std::vector<const Kernel*> chosen;
+    for (const Kernel* kernel : kernels) {
+        const bool imitation = kernel->parts > 0 && kernel->supported == everywhere;
+        if (kernel->supported() && (kernel_name == "auto" ? !imitation : kernel_name == kernel->name))
+            chosen.push_back(kernel);
+    }
+    if (!json) std::printf("medians (and ranges); a share is of the peak of its own moment\n");
+    for (const Kernel* kernel : chosen) {
+        double peak = 0;
+        for (int round = 0; round < 20; ++round) peak = std::max(peak, burn_rate(*kernel));
+        const double second = 1e9 / peak;
+        measured.add(
+            {"peaks", "10^9 operations in registers, " + label(*kernel) + ", 1 core", {second, second, second}, 1e9});
+    }
+    bench_memory_bandwidth(measured, 1);
+    const double bandwidth = bench_memory_bandwidth(measured, threads);
+    std::vector<double> rates;
+    for (const Kernel* kernel : chosen) rates.push_back(bench_products(measured, *kernel, threads));
+    bench_other_kernels(measured, *chosen[0], threads, bandwidth);
+    for (size_t i = 0; i < chosen.size(); ++i)  // with vectors only the best ones: the others are slower in proportion
+        if (chosen[i]->parts > 0 || i == 0 || chosen[i - 1]->parts > 0)
+            bench_updates(measured, *chosen[i], threads, rates[i]);
+    rusage use{};
+    getrusage(RUSAGE_SELF, &use);
+    if (!json) std::printf("peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
+    for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(measured, entries);
+    if (json) measured.print_json();
 }
 
 #ifdef WODTEM_MUJOCO

@@ -55,7 +55,7 @@ std::vector<const Kernel*> kernels_of_this_machine() {
         if (kernel->supported())
             found.push_back(kernel);
         else
-            std::printf("  this machine cannot run kernel %s: not tested\n", kernel->name);
+            std::printf("  this machine cannot run kernel %s %s: not tested\n", kernel->name, kernel->precision);
     }
     return found;
 }
@@ -233,7 +233,44 @@ struct Product {
     double exact, bound;
 };
 
-Product product(const float* a, const float* b, int K, int N, float start, bool fused) {
+// The nearest number of eight significant bits, by arithmetic: x = 0.1f * 2^e has its ties to even at nearbyint.
+float eight_bits(float x) {
+    int exponent = 0;
+    const float fraction = std::frexp(x, &exponent);
+    return std::ldexp(std::nearbyint(fraction * 256), exponent - 8);
+}
+
+// The same for bf16 parts: the products that the definition names, in its order.
+Product product_of_parts(const float* a, const float* b, int K, int N, float start, int parts) {
+    static const std::vector<std::pair<int, int>> turns[] = {
+        {}, {{0, 0}}, {{0, 1}, {0, 0}, {1, 0}}, {{0, 2}, {0, 1}, {0, 0}, {1, 0}, {1, 1}, {2, 0}}};
+    const auto part = [](float x, int i) {
+        for (; i > 0; --i) x -= eight_bits(x);
+        return eight_bits(x);
+    };
+    Product p = {start, start, std::fabs(start)};
+    for (int first = 0; first < K; first += 32) {
+        const int last = std::min(K, first + 32);
+        for (const auto& [i, j] : turns[parts]) {
+            float even = 0, odd = 0;
+            for (int k = first; k < last; ++k) (k % 2 == 0 ? even : odd) += part(a[k], i) * part(b[k * N], j);
+            p.value += even + odd;
+        }
+        for (int k = first; k < last; ++k) {
+            p.exact += static_cast<double>(a[k]) * b[k * N];
+            p.bound += std::fabs(static_cast<double>(a[k]) * b[k * N]);
+        }
+    }
+    // A part is at most 2^-8 of the one before. What is left out: a_0 b_1, b_0 a_1 and what follows; a_0 b_2, a_1 b_1,
+    // a_2 b_0 ...; the four products of order 2^-24. And a rounding for each of 16 k, each turn and each 32 k.
+    const double left_out[] = {0, 2 * 0x1p-8, 3 * 0x1p-16, 4 * 0x1p-24};
+    p.bound *= 1.01 * (left_out[parts] + (16 + parts * (parts + 1) / 2 * ((K + 31) / 32)) * unit);
+    return p;
+}
+
+Product product(const float* a, const float* b, int K, int N, float start, const Kernel& kernel) {
+    if (kernel.parts > 0) return product_of_parts(a, b, K, N, start, kernel.parts);
+    const bool fused = kernel.arithmetic == std::string("fused");
     Product p = {start, start, std::fabs(start)};
     for (int first = 0; first < K; first += 256) {
         float sum = 0;
@@ -258,8 +295,7 @@ void check_matmul(Compute& compute, Draws& draws, int M, int N, int K) {
         for (int j = 0; j < N; ++j)
             for (int store = 0; store < 2; ++store) {
                 float& c = expected[store][static_cast<size_t>(i * (N + 3) + j)];
-                const Product p =
-                    product(a.data() + i * K, b.data() + j, K, N, store == 0 ? 0.0f : c, compute.kernel.fused);
+                const Product p = product(a.data() + i * K, b.data() + j, K, N, store == 0 ? 0.0f : c, compute.kernel);
                 CHECK_CLOSE(p.value, p.exact, p.bound);
                 c = p.value;
             }
@@ -272,15 +308,20 @@ void check_matmul(Compute& compute, Draws& draws, int M, int N, int K) {
                 const Store how = store == 0 ? Store::overwrite : Store::accumulate;
                 matmul(compute, View<float>{c.data(), N + 3}, stored_a.view, stored_b.view, M, N, K, how);
                 bool same = same_bits(c, expected[store]);
-                if (!compute.kernel.fused) {
-                    matmul_plain(View<float>{plain.data(), N + 3}, stored_a.view, stored_b.view, M, N, K, how);
+                if (compute.kernel.arithmetic != std::string("fused")) {
+                    const View<float> to = {plain.data(), N + 3};
+                    if (compute.kernel.parts == 0)
+                        matmul_plain(to, stored_a.view, stored_b.view, M, N, K, how);
+                    else
+                        matmul_parts_plain(to, stored_a.view, stored_b.view, M, N, K, how, compute.kernel.parts);
                     same = same && same_bits(c, plain);
                 }
                 if (!same)
                     report_failure(__FILE__, __LINE__,
-                                   std::string(compute.kernel.name) + ", threads " + shown(compute.threads.count()) +
-                                       ", M N K " + shown(M) + " " + shown(N) + " " + shown(K) + ", transposed " +
-                                       shown(a_transposed) + shown(b_transposed) + ", store " + shown(store));
+                                   std::string(compute.kernel.name) + " " + compute.kernel.arithmetic + ", threads " +
+                                       shown(compute.threads.count()) + ", M N K " + shown(M) + " " + shown(N) + " " +
+                                       shown(K) + ", transposed " + shown(a_transposed) + shown(b_transposed) +
+                                       ", store " + shown(store));
             }
 }
 
@@ -294,7 +335,8 @@ TEST(matmul_has_the_bits_of_its_definition_around_every_tile_edge) {
         for (const int K : {0, 1, 255, 256, 257, 513})
             for (const int M : {0, 1, r - 1, r, r + 1, 2 * r + 1})
                 for (const int N : {0, 1, c - 1, c, c + 1, 2 * c})
-                    if (K < 300 || (M != r - 1 && N != c - 1)) check_matmul(compute, draws, M, N, K);
+                    if ((K < 300 && kernel->parts == 0) || (M != r - 1 && N != c - 1 && M <= r + 1 && N <= c + 1))
+                        check_matmul(compute, draws, M, N, K);
     }
 }
 
@@ -307,7 +349,7 @@ TEST(matmul_gives_the_same_bits_for_any_number_of_threads) {
                          300);  // many rows; blocks of rows
             check_matmul(compute, draws, 3, 9 * kernel->tile_columns,
                          70);  // wide: blocks of columns
-            check_matmul(compute, draws, 401, 5, 30);
+            if (kernel->parts == 0) check_matmul(compute, draws, 401, 5, 30);
         }
 }
 
@@ -327,10 +369,67 @@ TEST(matmul_of_one_row_equals_that_row_among_a_hundred) {
     }
 }
 
-TEST(kernels_are_chosen_by_name) {
-    CHECK_EQUAL(std::string(choose_kernel("portable").name), std::string("portable"));
+TEST(nearest_bf16_rounds_to_even_and_keeps_what_is_not_finite) {
+    Draws draws = {4};
+    for (const float x : draws.normals<float>(1000)) CHECK_EQUAL(bf16_nearest(x), eight_bits(x));
+    CHECK_EQUAL(bf16_nearest(1 + 0x1p-8f), 1.0f);             // halfway: to the even 1
+    CHECK_EQUAL(bf16_nearest(1 + 3 * 0x1p-8f), 1 + 0x1p-6f);  // halfway: up to the even one
+    CHECK_EQUAL(bf16_nearest(1 + 0x1p-8f + 0x1p-23f), 1 + 0x1p-7f);
+    CHECK_EQUAL(bf16_nearest(-INFINITY), -INFINITY);
+    CHECK(std::isnan(bf16_nearest(NAN)) && std::isnan(bf16_nearest(-NAN)));
+    CHECK(std::signbit(bf16_nearest(-0.0f)));
+}
+
+TEST(products_that_are_not_finite_stay_so_in_every_precision) {
+    for (const Kernel* kernel : kernels_of_this_machine())
+        for (const float bad : {NAN, INFINITY}) {
+            Compute compute(*kernel, 1);
+            float a[40], b[40], c = 0;
+            std::fill_n(a, 40, 1.0f), std::fill_n(b, 40, 1.0f);
+            a[33] = bad;
+            matmul(compute, View<float>{&c, 1}, {a, 40}, {b, 1}, 1, 1, 40, Store::overwrite);
+            CHECK(!std::isfinite(c));
+        }
+}
+
+TEST(every_part_of_a_product_is_prepared_and_finished_once) {
+    constexpr int M = 101, N = 70, K = 600;
+    Draws draws = {5};
+    const std::vector<float> a = draws.normals<float>(M * K), b = draws.normals<float>(K * N);
+    for (const Kernel* kernel : kernels_of_this_machine())
+        for (const int threads : {1, 3}) {
+            Compute compute(*kernel, threads);
+            std::vector<float> plain(M * N, 2.0f), c(M * N);
+            matmul(compute, View<float>{plain.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate);
+            const auto each = [&](const Block& block, auto&& f) {
+                for (int i = block.first_row; i < block.end_row; ++i)
+                    for (int j = block.first_column; j < block.end_column; ++j) f(c[static_cast<size_t>(i * N + j)]);
+            };
+            matmul(
+                compute, View<float>{c.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate,
+                [&](const Block& block) { each(block, [](float& x) { x += 2; }); },
+                [&](const Block& block) { each(block, [](float& x) { x *= -0.5f; }); });
+            for (float& x : plain) x *= -0.5f;
+            CHECK(same_bits(c, plain));
+        }
+}
+
+TEST(kernels_are_chosen_by_name_and_precision) {
+    const std::string best = kernels_of_this_machine().front()->name;
+    CHECK_EQUAL(std::string(choose_kernel("portable").arithmetic), std::string("plain"));
     CHECK_EQUAL(&choose_kernel("auto"), kernels_of_this_machine().front());
+    for (const char* precision : {"bf16x6", "bf16x3", "bf16"})
+        CHECK_EQUAL(std::string(choose_kernel("portable", precision).arithmetic), std::string(precision));
+    if (best == "amx") {
+        CHECK_EQUAL(std::string(choose_kernel("auto").arithmetic), std::string("bf16x6"));
+        CHECK_EQUAL(std::string(choose_kernel("auto", "bf16").name), best);
+    } else {  // an imitation is for whoever asks for it
+        CHECK_FAILS("usage.precision", choose_kernel("auto", "bf16"));
+        CHECK_FAILS("usage.kernel", choose_kernel("amx"));
+    }
+    CHECK_FAILS("usage.kernel", choose_kernel("avx2", "bf16"));
     CHECK_FAILS("usage.kernel", choose_kernel("abacus"));
+    CHECK_FAILS("usage.precision", choose_kernel("auto", "fp64"));
 }
 
 TEST(dot_equals_the_sum_in_double) {
@@ -470,23 +569,27 @@ TEST(gradients_of_small_operations_equal_central_differences) {
                       two = leaf(draws, 1, 1), table = leaf(draws, 4, 3);
     const std::vector<float> weights = draws.normals<float>(5);
     const std::vector<int> rows = {4, 0, 3}, places = {6, 1, 0, 5, 2}, index = {3, 0, 3, 1, 2};
+    Parameter<double> w = leaf(draws, 3, 3), b = leaf(draws, 1, 3), norm_w = leaf(draws, 1, 3),
+                      norm_b = leaf(draws, 1, 3);
+    const Affine<double> affine = {w.tensor(), b.tensor(), Layout::out_in};
     const auto dropped = [&](float p, bool residual) {
         return [&, p, residual](Tape<double>& tape) {
-            return add_dropout(tape, residual ? y.tensor() : Tensor<double>{}, x.tensor(), dropout_of(tape, p));
+            const DropoutAdd<double> finish(dropout_of(tape, p), residual ? y.tensor() : Tensor<double>{}, 3);
+            return linear(tape, x.tensor(), affine, finish);
         };
     };
     Gradients gradients = {"the small operations"};
     gradients.check("select_rows", [&](auto& t) { return select_rows(t, x.tensor(), rows.data(), 3); }, {&x});
-    gradients.check("add_dropout", dropped(0, true), {&x, &y});
-    gradients.check("add_dropout, p 0.4", dropped(0.4f, true), {&x, &y});
-    gradients.check("add_dropout, no residual", dropped(0.4f, false), {&x});
-    gradients.check("relu",
+    gradients.check("linear, dropout, residual", dropped(0, true), {&x, &y, &w, &b});
+    gradients.check("linear, dropout, residual, p 0.4", dropped(0.4f, true), {&x, &y, &w, &b});
+    gradients.check("linear, dropout, p 0.4", dropped(0.4f, false), {&x, &w, &b});
+    gradients.check("linear, relu", [&](auto& t) { return linear(t, x.tensor(), affine, Relu{}); }, {&x, &w, &b});
+    gradients.check("layer_norm, dropout, p 0.4",
                     [&](auto& t) {
-                        const Tensor<double> copy =
-                            add_dropout(t, {}, x.tensor(), dropout_of(t, 0));  // it works in place
-                        return relu(t, copy), copy;
+                        const DropoutAdd<double> finish(dropout_of(t, 0.4f), {}, 3);
+                        return layer_norm(t, x.tensor(), {norm_w.tensor(), norm_b.tensor()}, finish);
                     },
-                    {&x});
+                    {&x, &norm_w, &norm_b});
     gradients.check("tanh_of", [&](auto& t) { return tanh_of(t, x.tensor()); }, {&x});
     gradients.check("squash_log_std", [&](auto& t) { return squash_log_std(t, x.tensor()); }, {&x});
     gradients.check("place_tokens",
@@ -501,7 +604,10 @@ TEST(gradients_of_small_operations_equal_central_differences) {
     gradients.check("combine", [&](auto& t) { return combine(t, 0.7, one.tensor(), -2.0, two.tensor()); },
                     {&one, &two});
     gradients.check("a tensor used twice",
-                    [&](auto& t) { return add_dropout(t, tanh_of(t, x.tensor()), x.tensor(), dropout_of(t, 0)); },
+                    [&](auto& t) {
+                        const DropoutAdd<double> finish(dropout_of(t, 0), tanh_of(t, x.tensor()), 3);
+                        return linear(t, x.tensor(), affine, finish);
+                    },
                     {&x});
 }
 
@@ -1239,7 +1345,10 @@ TEST(dropout_keeps_its_share_and_scales_it_up) {
     tape.dropout_random.seed = test_seed();
     constexpr int n = 40000;
     const auto mask = [&](uint32_t site, float p) {
-        return values(add_dropout(tape, {}, filled(tape, n / 8, 8, 1), dropout_at(tape, site, p)));
+        const DropoutAdd<double> finish(dropout_at(tape, site, p), {}, 8);
+        std::vector<double> x(n, 1);
+        for (int row = 0; row < n / 8; ++row) finish.forward(x.data() + 8 * row, row, 0, 8);
+        return x;
     };
     const std::vector<double> first = mask(3, 0.1f);
     const double keep = 1 / (1 - static_cast<double>(0.1f));

@@ -37,7 +37,7 @@ Settings tiny_settings(const std::string& method, const std::string& alpha = "0.
         set_setting(settings, name, value);
     if (method != "dt") set_setting(settings, "online_steps", "400");
     set_setting(settings, "alpha", alpha);
-    settings.arithmetic = choose_kernel("auto").fused ? "fused" : "plain";
+    settings.arithmetic = choose_kernel("auto").arithmetic;
     return settings;
 }
 
@@ -45,12 +45,12 @@ void quiet_train(const Settings& settings, const std::string& folder, int thread
     const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
     std::fflush(stdout);
     dup2(null, 1), dup2(null, 2);
-    TrainOptions options;
-    options.threads = threads;
-    options.checkpoint_every = checkpoint_every;
+    const Kernel* kernel = *std::find_if(std::begin(kernels), std::end(kernels), [&](const Kernel* one) {
+        return one->supported() && settings.arithmetic == one->arithmetic;
+    });
     std::exception_ptr problem;
     try {
-        train(settings, folder, options);
+        train(settings, folder, {*kernel, threads, checkpoint_every});
     } catch (...) {
         problem = std::current_exception();
     }
@@ -510,6 +510,31 @@ TEST(wodtem_with_alpha_one_is_odt_bit_for_bit) {
     CHECK(odt.buffer.substr(odt.data_start) == one.buffer.substr(one.data_start));
 }
 
+// The same two promises, and that of being resumed, in each precision; where there is no matrix unit, by its imitation.
+TEST(promises_hold_in_every_precision) {
+    for (const char* precision : {"bf16x6", "bf16x3", "bf16"}) {
+        const Scratch scratch;
+        const auto settings = [&](const char* method, const char* alpha) {
+            Settings all = tiny_settings(method, alpha);
+            for (auto [name, value] : std::initializer_list<std::pair<const char*, const char*>>{
+                     {"offline_updates", "5"}, {"online_steps", "150"}, {"updates_per_iteration", "1"}})
+                set_setting(all, name, value);
+            all.arithmetic = precision;
+            return all;
+        };
+        quiet_train(settings("odt", "1"), scratch / "odt");
+        quiet_train(settings("wodtem", "1"), scratch / "one", 3);
+        CHECK(read_file(scratch / "odt/policy.csv") == read_file(scratch / "one/policy.csv"));
+        stop_requested = 1;
+        CHECK_FAILS("run.stopped", quiet_train(settings("wodtem", "1"), scratch / "stopped"));
+        stop_requested = 0;
+        quiet_train(settings("wodtem", "1"), scratch / "stopped");
+        check_same_results(scratch / "one", scratch / "stopped");
+        quiet_train(settings("wodtem", "0.75"), scratch / "wodtem");
+        CHECK(read_file(scratch / "wodtem/policy.csv") != read_file(scratch / "one/policy.csv"));
+    }
+}
+
 // Kills a run again and again, at any moment, with a checkpoint after each update; it must end as if nothing had been.
 TEST(a_run_killed_at_any_moment_ends_with_the_same_bytes) {
     const Scratch scratch;
@@ -842,7 +867,7 @@ Settings tiny_mujoco_settings(const std::string& task, const std::string& method
                                                                                          {"buffer_size", "5"}})
         set_setting(settings, name, value);
     if (method != "dt") set_setting(settings, "online_steps", task.starts_with("hopper") ? "120" : "1000");
-    settings.arithmetic = choose_kernel("auto").fused ? "fused" : "plain";
+    settings.arithmetic = choose_kernel("auto").arithmetic;
     settings.mujoco = mujoco_version();
     return settings;
 }
@@ -957,6 +982,12 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --set alpha", 2, "NAME=VALUE");
     check_shell("./wodtem train gridworld --set width=15 --set heads=2", 2, "nearest width is 16");
     check_shell("./wodtem train gridworld --kernel sse9", 2, "portable");
+    check_shell("./wodtem train gridworld --precision fp16", 2, "portable bf16x3");
+    check_shell("./wodtem train gridworld --kernel avx2 --precision bf16", 2, "portable bf16x3");
+    if (choose_kernel("auto").name != std::string("amx")) {
+        check_shell("./wodtem train gridworld --precision bf16", 2, "portable bf16x3");
+        check_shell("./wodtem train gridworld --kernel amx", 2, "portable bf16x3");
+    }
     check_shell("./wodtem train gridworld --threads 1000", 2, "nearest is 256");
     check_shell("./wodtem train", 2, "TASK");
     check_shell("./wodtem sweep --seeds 4-0", 2, "range");
