@@ -16,6 +16,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <functional>
 #include <memory>
 #include <new>
 #include <stdexcept>
@@ -634,6 +635,9 @@ struct Tape {
     size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: a fresh mask for each
+    // Told of each layer's output as soon as it is there (its memory may serve otherwise in backward()). Empty: no one
+    // watches.
+    std::function<void(const std::string& name, const Tensor<T>& output)> watch;
 
     explicit Tape(Compute& c) : compute(c) {}
 
@@ -651,8 +655,15 @@ struct Tape {
     // Where this tape adds up the gradient of a parameter.
     T* gradient(Tensor<T> parameter) const { return parameter.gradient + block * parameter.size(); }
 
+    // Shows `output` to whoever watches.
+    Tensor<T> show(const std::string& name, Tensor<T> output) const {
+        if (watch) watch(name, output);
+        return output;
+    }
+
     // An input: copied, without gradient.
-    Tensor<T> constant(const float* data, int rows, int columns) {
+    template <class Number>
+    Tensor<T> constant(const Number* data, int rows, int columns) {
         Tensor<T> x = {nullptr, nullptr, rows, columns};
         x.value = scratch<T>(x.size());
         std::copy_n(data, x.size(), x.value);
@@ -1308,11 +1319,14 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
     const Tensor<T> kv = linear(tape, h, block.c_attn, d, 2 * d);
     const Tensor<T> a = attention(tape, q, kv, keep(tape, spans), static_cast<int>(spans.size()), rows,
                                   model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
-    const Tensor<T> x1 = add_dropout(tape, all_ask ? x : select_rows(tape, x, rows, asked),
-                                     linear(tape, a, block.attn_proj), dropout_at(tape, dropout_site(layer, 1), p));
+    const std::string name = "transformer.h." + std::to_string(layer);
+    const Tensor<T> x1 = tape.show(
+        name + ".attn", add_dropout(tape, all_ask ? x : select_rows(tape, x, rows, asked),
+                                    linear(tape, a, block.attn_proj), dropout_at(tape, dropout_site(layer, 1), p)));
     const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc);
     relu(tape, hidden);
-    return add_dropout(tape, x1, linear(tape, hidden, block.mlp_proj), dropout_at(tape, dropout_site(layer, 2), p));
+    return tape.show(
+        name, add_dropout(tape, x1, linear(tape, hidden, block.mlp_proj), dropout_at(tape, dropout_site(layer, 2), p)));
 }
 
 // y = -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
@@ -1367,18 +1381,22 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
 template <class T>
 Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Ask ask) {
     const TokenLayout layout = token_layout(batch, ask);
-    Tensor<T> x = layer_norm(tape, embed_tokens(tape, model, batch, layout), model.embed_ln);
+    Tensor<T> x = tape.show("embed", embed_tokens(tape, model, batch, layout));
+    x = tape.show("embed_ln", layer_norm(tape, x, model.embed_ln));
     x = add_dropout(tape, {}, x, dropout_at(tape, 0, model.config.dropout));
     for (int layer = 0; layer < model.config.layers; ++layer) {
         const bool last = layer + 1 == model.config.layers;
         x = transformer_block(tape, model, layer, x, last ? layout.asked : layout.all,
                               last ? layout.asking : layout.every_token);
     }
-    x = layer_norm(tape, x, model.ln_f);
-    const Tensor<T> mean = linear(tape, x, model.predict_mean);
-    if (model.config.head == Head::categorical) return {log_softmax(tape, mean), {}};
-    if (model.config.head == Head::deterministic) return {tanh_of(tape, mean), {}};
-    return {mean, squash_log_std(tape, linear(tape, x, model.predict_log_std))};
+    x = tape.show("transformer.ln_f", layer_norm(tape, x, model.ln_f));
+    Policy<T> policy = {linear(tape, x, model.predict_mean), {}};
+    if (model.config.head == Head::categorical) policy.mean = log_softmax(tape, policy.mean);
+    if (model.config.head == Head::deterministic) policy.mean = tanh_of(tape, policy.mean);
+    tape.show("policy.mean", policy.mean);
+    if (model.config.head == Head::squashed_gaussian)
+        policy.log_std = tape.show("policy.log_std", squash_log_std(tape, linear(tape, x, model.predict_log_std)));
+    return policy;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1496,8 +1514,8 @@ Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* action
 }
 
 // sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
-template <class T>
-Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const float* coefficients) {
+template <class T, class Number>
+Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
     const Tensor<T> y = tape.make(1, 1), c = tape.constant(coefficients, x.rows, 1);
     y.value[0] = 0;
     for (int i = 0; i < x.rows; ++i) y.value[0] += c.value[i] * x.value[i];
