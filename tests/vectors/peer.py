@@ -63,6 +63,8 @@ class File:
                         short = value.astype(np.float32)
                     if np.array_equal(short.astype(np.float64), value, equal_nan=True):
                         value = short
+                if value.dtype == np.int64 and abs(value).max(initial=0) < 2**31:
+                    value = value.astype(np.int32)
                 if part == "out" and value.dtype.kind in "iub" and not tolerance.startswith("exact"):
                     self.tolerance(name, key, "exact: whole numbers")
                 self.tensors[f"{name}/{part}/{key}"] = value
@@ -656,8 +658,680 @@ def policy_deterministic():
     f.save()
 
 
+# ----------------------------------------------------------------------------------------------------------------------
+# The memory: a list of entries in order of insertion; a linear scan; nothing clever.
+
+
+class Table:
+    def __init__(self, capacity, K=1, epsilon=math.inf, eviction="lfu", projection=None, exclude_self=False):
+        self.capacity, self.K, self.epsilon, self.eviction = capacity, K, epsilon, eviction
+        self.projection, self.exclude_self = projection, exclude_self
+        self.entries, self.clock, self.changes = [], 0, [0, 0, 0, 0]
+
+    def touch(self, entry):
+        self.clock += 1
+        entry["accesses"] = entry["accesses"] + 1 if self.eviction == "lfu" else self.clock
+
+    def find(self, state):  # -0.0 == 0.0 in Python too
+        return next((e for e in self.entries if np.array_equal(e["state"], state)), None)
+
+    def update(self, row, state, action, d):
+        entry = self.find(state)
+        if entry is None:
+            if len(self.entries) == self.capacity:
+                self.entries.remove(min(self.entries, key=lambda e: e["accesses"]))  # ties: the oldest
+                self.changes[3] += 1
+            entry = {"row": row, "state": state, "action": action, "e": d, "accesses": 0}
+            self.entries.append(entry)
+            self.changes[0] += 1
+        elif entry["e"] < d:
+            entry["action"], entry["e"] = action, d
+            self.changes[1] += 1
+        else:
+            self.changes[2] += 1
+        self.touch(entry)
+
+    def place(self, state):
+        return state if self.projection is None else np.float32(self.projection @ state).astype(np.float64)
+
+    def nearest(self, query):
+        q, own = self.place(query), self.find(query) if self.exclude_self else None
+        found = [(float(((self.place(e["state"]) - q)**2).sum()), e) for e in self.entries if e is not own]
+        found = [pair for pair in found if pair[0] < self.epsilon]
+        return sorted(found, key=lambda pair: pair[0])[:self.K]  # stable: ties, the older first
+
+    def e_hat(self, found):
+        weights = [math.exp(found[0][0] - distance) for distance, _ in found]  # exp(-q) over the largest of them
+        return sum(w * e["e"] for w, (_, e) in zip(weights, found)) / sum(weights) if found else math.nan
+
+
+def memory_update():
+    f = File("memory_update", "WODTEM eq. (4); WODTEM sec. IV-B.1: the least frequently accessed entry goes")
+
+    def case(name, note, states, d, actions=None, looks_up=None, **settings):
+        states, d = np.array(states, dtype=np.float64), np.array(d, dtype=np.float64)
+        n = len(states)
+        actions = paint(1, n, 2) if actions is None else np.array(actions)
+        table = Table(settings.get("capacity", n), settings.get("K", 1), settings.get("epsilon", math.inf),
+                      settings.get("eviction", "lfu"))
+        inputs = {"states": states, "actions": actions, "e": d}
+        if looks_up is not None:
+            inputs["looks_up"] = np.array(looks_up)
+        for row in range(n):
+            if looks_up is not None and looks_up[row]:
+                for _, entry in table.nearest(states[row]):
+                    table.touch(entry)
+            else:
+                table.update(row, states[row], actions[row], d[row])
+        there = [table.find(s) for s in states]
+        nothing = {"e": math.nan, "action": np.full(2, math.nan), "accesses": 0}
+        f.case(name, note, "exact: numbers are kept, never computed", NUMPY + ", a list and a linear scan", inputs,
+               {"stored": np.array([e is not None for e in there], dtype=np.int64),
+                "e": np.array([(e or nothing)["e"] for e in there]),
+                "actions": np.array([(e or nothing)["action"] for e in there]),
+                "accesses": np.array([(e or nothing)["accesses"] for e in there]),
+                "size": np.array(len(table.entries)), "changes": np.array(table.changes)}, **settings)
+
+    a, b, c, d4 = [0.5, 1.0], [0.5, 1.25], [-0.5, 1.0], [3.0, 0.0]
+    case("new_states", "a state that is not stored is, with its action and its return, also when that is negative",
+         [a, b, c], [-1.0, 2.0, 0.0])
+    case("keeps_highest", "keeps_latest: of several returns the highest stays, with its action", [a, b, a, b, a],
+         [1.0, 5.0, 3.0, 4.0, 2.0])
+    case("equal_replaces", "equal_replaces: at e = d the older action stays", [a, a], [1.5, 1.5])
+    case("one_ulp", "e < d by one ulp of double", [a, a, b, b],
+         [1.0, np.nextafter(1.0, 2.0), 1.0, np.nextafter(1.0, 0.0)])
+    case("twice_in_one_trajectory", "the same state twice in one trajectory, in order of time", [a, b, a, c],
+         [2.5, 2.0, 1.5, 1.0])
+    case("minus_zero", "-0.0 and 0.0 are one state", [[0.0, -0.0], [-0.0, 0.0], [0.0, 0.0]], [1.0, 2.0, 3.0])
+    case("one_bit", "states that differ in the last bit are two: no rounding, no tolerance, no projection",
+         [[1.0, 0.0], [float(np.nextafter(np.float32(1), np.float32(2))), 0.0]], [1.0, 2.0])
+    case("full_table", "a full table gives up the least frequently accessed entry: a was met three times, b twice, c once",
+         [a, b, c, a, a, b, d4], [1, 1, 1, 0, 0, 0, 1], capacity=3)
+    case("eviction_tie", "least-used tie: of equal counts the oldest goes; the new entry itself does not", [a, b, c, d4],
+         [4.0, 3.0, 2.0, 1.0], capacity=3)
+    case("evict_lowest_return", "it is not the lowest return that goes", [a, b, a, c], [1.0, 9.0, 0.5, 5.0], capacity=2)
+    case("update_counts", "an update that changes nothing is an access too", [a, b, b, b, c], [1, 1, 0, 0, 1], capacity=2)
+    case("look_up_counts", "a neighbour within epsilon is accessed by a look-up, one beyond is not",
+         [a, b, c, b, b, d4], [1, 1, 1, 0, 0, 1], looks_up=[0, 0, 0, 1, 1, 0], capacity=3, K=3, epsilon=0.25)
+    case("lru", "least recently used, for comparison: a was met often, but long ago", [a, a, a, b, c, d4],
+         [1, 1, 1, 1, 1, 1], capacity=3, eviction="lru")
+    case("returns_after_eviction", "a state that comes back is new: its old return is forgotten", [a, b, c, a],
+         [9.0, 1.0, 1.0, 2.0], capacity=2)
+    f.save()
+
+
+def memory_inputs(states, e, query, actions=None, projection=None):
+    inputs = {"states": np.array(states, dtype=np.float64), "e": np.array(e, dtype=np.float64),
+              "query": np.array(query, dtype=np.float64)}
+    if actions is not None:
+        inputs["actions"] = np.array(actions, dtype=np.float64)
+    if projection is not None:
+        inputs["projection"] = np.array(projection)
+    return inputs
+
+
+def filled(inputs, **settings):
+    states = inputs["states"]
+    table = Table(settings.get("capacity", max(1, len(states))), settings.get("K", 1), settings.get("epsilon", math.inf),
+                  "lfu", inputs.get("projection"), settings.get("exclude_self", 0) == 1)
+    actions = inputs.get("actions", np.zeros((len(states), 1)))
+    for row in range(len(states)):
+        table.update(row, states[row], actions[row], inputs["e"][row])
+    return table
+
+
+def memory_lookup():
+    f = File("memory_lookup", "WODTEM sec. IV-B.2: K(s_q); WODTEM eq. (5)")
+
+    def case(name, note, states, e, query, projection=None, **settings):
+        inputs = memory_inputs(states, e, query, None, projection)
+        table = filled(inputs, **settings)
+        found = [table.nearest(q) for q in inputs["query"]]
+        K, m = settings.get("K", 1), len(found)
+        neighbours, distances = np.full((m, K), -1), np.full((m, K), math.inf)
+        for i, row in enumerate(found):
+            for k, (distance, entry) in enumerate(row):
+                neighbours[i, k], distances[i, k] = entry["row"], distance
+        near = max([d for row in found for d, _ in row], default=0.0)
+        S = inputs["states"].shape[1]
+        f.case(name, note, f"float32 {(2 * (S + 4) * near + 8) * U:.2g}: distances and exp are float32: a distance of up to "
+               f"{near:.3g} takes {S} + 4 roundings; sums are double", NUMPY + ", a linear scan", inputs,
+               {"neighbours": neighbours, "count": np.array([len(row) for row in found]), "distances": distances,
+                "e_hat": np.array([table.e_hat(row) for row in found])}, **settings)
+
+    a, b, c = [0.0, 0.0], [0.5, 0.0], [0.0, 1.0]
+    grid = [a, b, c, [1.0, 1.0], [-0.5, 0.25]]
+    e = [10.0, 20.0, -5.0, 3.0, 0.5]
+    case("weighted_mean", "unweighted_mean: e-hat weighs by exp(-q)", grid, e, [[0.25, 0.25], [0.0, 0.5]], K=3)
+    case("root_taken", "root_taken: q is the squared distance; the nearest two lie at 1/4 and 1", grid, e, [b, [0.0, 2.0]],
+         K=2)
+    case("empty_table", "an empty table: no neighbour, e-hat unknown", np.zeros((0, 2)), [], [a], K=2, epsilon=1.0)
+    case("one_entry", "one entry: e-hat is its e, whatever the distance", [a], [7.25], [[3.0, 4.0], a], K=2)
+    case("K_beyond_entries", "K larger than the table", grid, e, [[0.25, 0.5]], K=9)
+    below, above = np.nextafter(np.float32(0.5), np.float32([0, 1])).astype(np.float64)
+    case("epsilon_reached", "epsilon is strict: q just below, at, just above 1/4", [a], [4.0],
+         [[below, 0.0], [0.5, 0.0], [above, 0.0]], K=1, epsilon=0.25)
+    case("epsilon_before_K", "the K nearest, of those within epsilon: none that lies beyond fills up K", grid, e,
+         [[0.125, 0.0]], K=4, epsilon=0.2)
+    case("ties_older_first", "tie: of equal distances the older entry is the nearer one", [b, [-0.5, 0.0], [0.0, 0.5], a], e[:4],
+         [a], K=3)
+    case("ties_cut", "tie at the K-th place: the older entry stays", [[0.0, 0.5], b, [-0.5, 0.0], [0.0, -0.5]],
+         [1.0, 2.0, 3.0, 4.0], [a], K=2)
+    case("exact_hit", "an exact hit is a neighbour at distance 0 beside others, not the answer alone", grid, e, [c], K=2)
+    case("exclude_self", "the option that leaves the query's own entry out", grid, e, [c, [0.25, 0.25]], K=2,
+         exclude_self=1)
+    case("minus_zero", "-0.0 lies at distance 0 from 0.0, and is its own entry", grid, e, [[-0.0, -0.0]], K=1,
+         exclude_self=1)
+    case("far", "exp(-q) underflows, 0 / 0: at q = 900 and 961 e-hat is still the nearer one's", [[0.0, 0.0], [61.0, 0.0]],
+         [2.0, 8.0], [[30.0, 0.0], [30.5, 0.0]], K=2)
+    many = paint(5, 200, 3)
+    case("many", "200 entries, five numbers of neighbours at once: what a tree must find", many, paint(90, 200) * 16,
+         paint(44, 12, 3) + 2.0**-9, K=5, epsilon=0.05)
+    states = paint(3, 6, 8)
+    projection = paint(21, 4, 8)
+    case("projected", "distances are those of the projected states, projection [F1, F] times a state", states,
+         paint(7, 6) * 4, paint(13, 3, 8), projection, K=3, epsilon=8.0)
+    case("projected_ties", "states that project to the same point are two entries at one distance", [[1.0, 2.0], [1.0, 5.0]],
+         [1.0, 3.0], [[1.0, 7.0]], np.array([[1.0, 0.0]]), K=2)
+    case("repeated_state", "the same state twice in the table's history is one entry, with the higher e", [a, b, a],
+         [1.0, 2.0, 6.0], [a], K=3)
+    f.save()
+
+
+def memory_action():
+    f = File("memory_action", "WODTEM eq. (6)")
+
+    def case(name, note, states, e, query, uniform, rows, actions=None, **settings):
+        """rows: which entry's action each query draws; checked below against the cumulative probabilities."""
+        actions = paint(31, len(states), 2) if actions is None else np.array(actions)
+        inputs = memory_inputs(states, e, query, actions)
+        table, tau = filled(inputs, **settings), settings.get("tau", 1.0)
+        for q, u, row in zip(inputs["query"], uniform, rows):
+            found = [entry for _, entry in table.nearest(q)]  # closest first
+            best = max(entry["e"] for entry in found)
+            odds = [math.exp((entry["e"] - best) / tau) for entry in found]
+            ends = np.cumsum(odds) / sum(odds)
+            chosen = int(np.searchsorted(ends, u, side="right"))
+            assert found[min(chosen, len(found) - 1)]["row"] == row, (name, u, ends, [x["row"] for x in found])
+        f.case(name, note, "exact: an action is chosen, not computed", CLOSED, dict(inputs, uniform=np.array(uniform)),
+               {"action": actions[rows]}, **settings)
+
+    line = [[0.0], [0.25], [0.5]]
+    near = [[0.0]]
+    case("equal_returns", "equal e: a third each, the closest first; uniform 0 and 1 - 2^-24", line, [5.0, 5.0, 5.0],
+         near * 6, [0.0, 1 / 3 - 1e-6, 1 / 3 + 1e-6, 2 / 3 - 1e-6, 2 / 3 + 1e-6, 1 - 2.0**-24], [0, 0, 1, 1, 2, 2], K=3)
+    p = math.exp(-1) / (1 + math.exp(-1) + math.exp(-2))
+    case("softmax_of_returns", "weights_by_distance: the odds are exp(e), whatever the distance; not proportional to e", line,
+         [1.0, 2.0, 3.0], near * 4, [p * math.exp(-1) - 1e-6, p * math.exp(-1) + 1e-6, p * (1 + math.exp(-1)) - 1e-6,
+                                     p * (1 + math.exp(-1)) + 1e-6], [0, 1, 1, 2], K=3)
+    case("exp_overflow", "exp_overflow: e of 0, 300 and 3000: the largest is subtracted first", line, [0.0, 3000.0, 300.0],
+         near * 3, [0.0, 0.5, 1 - 2.0**-24], [1, 1, 1], K=3)
+    case("negative_returns", "e of -1000: exp underflows for all of them", line, [-1000.0, -1000.0, -1001.0], near * 2,
+         [0.0, 1 - 2.0**-24], [0, 2], K=3)
+    case("one_neighbour", "one neighbour: its action, whatever the number", [[0.5]], [2.0], near * 2, [0.0, 1 - 2.0**-24],
+         [0, 0], K=2)
+    case("only_neighbours", "an entry beyond epsilon is never drawn, however large its e", line, [1.0, 1.0, 99.0], near * 2,
+         [0.25, 1 - 2.0**-24], [0, 1], K=3, epsilon=0.25)
+    case("order_of_distance", "the shares lie in order of distance, not of age", [[0.5], [0.25], [0.0]], [1.0, 1.0, 1.0],
+         near * 3, [0.1, 0.5, 0.9], [2, 1, 0], K=3)
+    case("temperature", "tau divides e", line, [0.0, 10.0, 20.0], near * 2, [0.05, 0.2], [0, 1], K=3, tau=10.0)
+    f.save()
+
+
+def weights():
+    f = File("weights", "WODTEM eq. (7)")
+
+    def case(name, note, states, e, query, d, alpha, short=None, **settings):
+        inputs = memory_inputs(states, e, query)
+        table = filled(inputs, **settings)
+        found = [table.nearest(q) for q in inputs["query"]]
+        e_hat = [table.e_hat(row) for row in found]
+        if short is None:
+            short = [not math.isnan(h) and x < h for x, h in zip(d, e_hat)]
+        near = max([q for row in found for q, _ in row], default=0.0)
+        f.case(name, note, f"float32 {(2 * (inputs['states'].shape[1] + 4) * near + 8) * U:.2g}: as in memory_lookup",
+               CLOSED, dict(inputs, d=np.array(d, dtype=np.float64)),
+               {"w": np.where(short, alpha, 1.0), "e_hat": np.array(e_hat)}, alpha=alpha, **settings)
+        f.tolerance(name, "w", "exact: 1 or alpha")
+
+    a, b = [0.0], [0.5]
+    up, down = np.nextafter(3.0, 4.0), np.nextafter(3.0, 2.0)
+    case("comparison_strict", "comparison_strict: d = e-hat is optimal; one ulp below is not, one above is", [a], [3.0],
+         [a] * 3, [3.0, down, up], 0.75)
+    case("alpha_on_wrong_side", "alpha_on_wrong_side: what falls short gets alpha, what does not gets 1", [a, b], [1.0, 5.0],
+         [a, a, b, b], [0.5, 4.0, 6.0, 2.0], 0.9, K=2)
+    case("no_neighbour", "no neighbour: w = 1, nothing speaks against the action; nor does an empty table", [a], [100.0],
+         [[2.0], a], [0.0, 0.0], 0.75, epsilon=0.25)
+    case("empty_table", "an empty table", np.zeros((0, 1)), [], [a], [-5.0], 0.75)
+    third = [[1 / 8], [2 / 8], [3 / 8]]
+    case("mean_of_equals", "a rounded mean of equal e exceeds them: d = e is optimal whatever the weights", third,
+         [0.1, 0.1, 0.1], [a, [0.7001953125], [0.2998046875], [0.123046875]], [0.1] * 4, 0.75, [False] * 4, K=3)
+    case("alpha_zero", "alpha 0", [a], [1.0], [a, a], [0.0, 2.0], 0.0)
+    case("alpha_one", "alpha 1: plain ODT", [a], [1.0], [a, a], [0.0, 2.0], 1.0)
+    case("between", "d between the smaller and the larger e: against the weighted mean, not against either", [a, b], [0.0, 1.0],
+         [a, a, b, b], [0.43, 0.44, 0.56, 0.57], 0.5, K=2)
+    f.save()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# objective and optimizer
+
+
+def mean_over(lengths, x):
+    """Over the steps of each window, then over windows."""
+    return sum(part.mean() for part in torch.split(x, list(lengths))) / len(lengths)
+
+
+def objective_of(head, policy, actions, remembered, w, lengths, noise, lam):
+    if head == "categorical":
+        log_prob = lambda a: policy[0][np.arange(len(a)), a]
+        entropy = -(torch.exp(policy[0]) * policy[0]).sum(-1)
+    elif head == "gaussian":
+        log_prob = lambda a: gaussian_log_prob(*policy, torch.as_tensor(a))
+        entropy = gaussian_entropy(*policy, torch.as_tensor(noise))
+    else:
+        log_prob = lambda a: -((policy[0] - torch.as_tensor(a))**2).mean(-1)
+        entropy = None
+    w = torch.as_tensor(np.float64(w))
+    L = -mean_over(lengths, w * log_prob(actions)) - mean_over(lengths, (1 - w) * log_prob(remembered))
+    if entropy is None:
+        return L, None, L
+    H = mean_over(lengths, entropy)
+    return L, H, L - lam * H
+
+
+def objective():
+    f = File("objective", "WODTEM eq. (1), (2), (3), (8), (9), (10)")
+
+    def case(name, note, lengths, w, head="gaussian", lam=0.1, eta=-2.0, equal=False, A=2, scale=1.0):
+        n, log_lambda = sum(lengths), float(np.float32(math.log(lam)))
+        w = np.float32(w).astype(np.float64)
+        if head == "categorical":
+            x = {"logits": tensor(paint(1, n, 5, scale=2.0))}
+            policy = [torch.log_softmax(x["logits"], -1)]
+            actions, remembered = (np.arange(n) * 3) % 5, (np.arange(n) * 2 + 1) % 5
+        elif head == "gaussian":
+            x = {"mean": tensor(paint(1, n, A)), "log_std": tensor(paint(30, n, A, scale=scale))}
+            policy = list(x.values())
+            actions, remembered = paint(20, n, A), paint(77, n, A)
+        else:
+            x = {"raw": tensor(paint(1, n, A))}
+            policy = [torch.tanh(x["raw"])]
+            actions, remembered = paint(20, n, A), paint(77, n, A)
+        if equal:
+            remembered = actions
+        noise = paint(60, n, A, scale=2.0)
+        L, H, loss = objective_of(head, policy, actions, remembered, w, lengths, noise, math.exp(log_lambda))
+        inputs = dict(x, lengths=np.array(lengths), weights=w, actions=actions, remembered_actions=remembered)
+        if H is not None:
+            inputs["log_temperature"] = np.float64(log_lambda)
+        if head == "gaussian":
+            inputs["noise"] = noise
+        outputs = {"L": L, "loss": loss}
+        g = torch.autograd.grad(loss, list(x.values()))
+        if H is not None:
+            outputs["H"] = H
+            # Adam's first step on log lambda: its size is the learning rate, its sign that of lambda (H - eta).
+            slope = math.exp(log_lambda) * (float(H) - eta)
+            outputs["log_temperature"] = np.array(log_lambda - 1e-4 * slope / (abs(slope) + 1e-8))
+        outputs.update({"gradient/" + key: value for key, value in zip(x, g)})
+        scale_of = min(float(v.detach().abs().max()) for k, v in outputs.items() if k != "log_temperature")
+        spread = max(1.0, float(max(abs(p).max() for p in policy)))
+        bound = (n + 64) * U * 8 * spread / min(1.0, scale_of)
+        f.case(name, note, f"float64 1e-12, float32 {bound:.2g}: {n} + 64 roundings of terms up to {8 * spread:.2g}", TORCH,
+               inputs, outputs, **({} if H is None else {"eta": eta}))
+        f.tolerance(name, "gradient", f"float64 1e-10, float32 {bound * 4:.2g}: as the case, through two squares")
+        if H is not None:
+            f.tolerance(name, "log_temperature", "float32 2e-07: a number of the size of log lambda, rounded twice")
+
+    half = lambda n: np.where(np.arange(n) % 2 == 0, 1.0, 0.75)
+    for head in ("gaussian", "categorical"):
+        case(head + "_mixed", "second_term_missing, w and 1 - w exchanged; the sign of H", [3, 3], half(6), head)
+        case(head + "_window_mean", "window_mean against batch_mean: steps of short windows count more", [1, 4, 2], half(7), head)
+        case(head + "_alpha_zero", "alpha 0: where all fall short only the remembered actions count", [2, 3], np.zeros(5), head)
+        case(head + "_alpha_one", "alpha 1: eq. (9) is eq. (2), the remembered actions do not count", [2, 3], np.ones(5), head)
+        case(head + "_none_short", "the same loss as alpha 1 with the actions remembered: w + (1 - w) = 1", [2, 3], half(5), head,
+             equal=True)
+        case(head + "_one_step", "one window of one step", [1], [0.75], head)
+    case("dt", "DT: the squared error, no entropy term", [2, 2], np.ones(4), "deterministic")
+    case("H_above_eta", "lambda falls when H is above eta", [3], np.ones(3), eta=-5.0)
+    case("H_below_eta", "lambda rises when H is below eta: lambda_gradient_leaks, its sign", [3], np.ones(3), eta=5.0)
+    case("large_lambda", "padding_in_entropy; lambda times H, not log lambda times H", [2, 1], half(3), lam=4.0)
+    f.save()
+
+
+class PeerOptimizer:
+    """LAMB or AdamW over a dictionary of tensors, in float64, from the papers, with ODT's choices."""
+
+    def __init__(self, rule, lr, wd=0.0, clip=0.25, warmup=0, betas=(0.9, 0.999), eps=1e-8, always=False, steps=0):
+        self.rule, self.lr, self.wd, self.clip, self.warmup = rule, lr, wd, clip, warmup
+        self.betas, self.eps, self.always, self.steps = betas, eps, always, steps
+        self.m, self.v = {}, {}
+
+    def step(self, p, g):
+        """p, g: name -> array. Changes p; returns the norm of g."""
+        norm = math.sqrt(sum(float((x * x).sum()) for x in g.values()))
+        scale = min(1.0, self.clip / (norm + 1e-6)) if self.clip > 0 else 1.0
+        lr = self.lr * min(1.0, (self.steps + 1) / self.warmup if self.warmup else 1.0)
+        self.steps += 1
+        b1, b2 = self.betas
+        for name in p:
+            x = g[name] * scale
+            m = self.m[name] = b1 * self.m.get(name, 0 * x) + (1 - b1) * x
+            v = self.v[name] = b2 * self.v.get(name, 0 * x) + (1 - b2) * x * x
+            u = (m / (1 - b1**self.steps)) / (np.sqrt(v / (1 - b2**self.steps)) + self.eps)
+            trust = 1.0
+            if self.rule == "lamb":
+                u = u + self.wd * p[name]
+                a, b = np.sqrt((p[name]**2).sum()), np.sqrt((u**2).sum())
+                if (self.wd != 0 or self.always) and a > 0 and b > 0:
+                    trust = a / b
+            else:
+                p[name] = p[name] * (1 - lr * self.wd)
+            p[name] = p[name] - lr * trust * u
+        return norm
+
+
+def optimizer():
+    f = File("optimizer", "none: LAMB as ODT has it, AdamW, Adam")
+
+    def case(name, note, parameters, g, **settings):
+        """parameters: name -> array; g: name -> [steps, ...]."""
+        renamed = {"weight_decay": "wd", "clip_norm": "clip", "warmup_updates": "warmup", "optimizer_epsilon": "eps",
+                   "learning_rate": "lr", "updates_before": "steps"}
+        arguments = {renamed[k]: v for k, v in settings.items() if k in renamed}
+        arguments["betas"] = (settings.get("beta1", 0.9), settings.get("beta2", 0.999))
+        o = PeerOptimizer(settings.get("optimizer", "lamb"), always=settings.get("always_adapt", 0) == 1, **arguments)
+        p = {k: np.array(v, dtype=np.float64) for k, v in parameters.items()}
+        after, norms = {k: [] for k in p}, []
+        steps = len(next(iter(g.values())))
+        for i in range(steps):
+            norms.append(o.step(p, {k: v[i] for k, v in g.items()}))
+            for k in p:
+                after[k].append(p[k].copy())
+        inputs = {"parameter/" + k: v for k, v in parameters.items()}
+        inputs.update({"gradient/" + k: v for k, v in g.items()})
+        outputs = {"after/" + k: np.array(v) for k, v in after.items()}
+        outputs["norm"] = np.array(norms)
+        f.case(name, note, f"float32 {(4 + 24 * settings['learning_rate']) * steps * U:.2g}: {steps} steps, each adds to a number of "
+               "the size of the parameter, rounded twice; the step itself rounds 24 times", NUMPY, inputs, outputs, **settings)
+        for k, v in after.items():
+            moved = settings["learning_rate"] * steps
+            if not np.any(np.array(parameters[k])):
+                f.tolerance(name, "after/" + k, f"float32 {40 * steps * U:.2g}, absolute {16 * moved * U:.2g}: from zero, the step is "
+                            "all there is")
+
+    def gradients_of(shapes, steps, scale=1.0):
+        return {k: paint(100 + 31 * i, steps, *shape, scale=scale) for i, (k, shape) in enumerate(shapes.items())}
+
+    shapes = {"a.weight": (4, 3), "b.bias": (5,)}
+    p = {k: paint(7 + i, *shape) for i, (k, shape) in enumerate(shapes.items())}
+    g = gradients_of(shapes, 5)
+    common = {"learning_rate": 0.0625, "weight_decay": 0.125, "clip_norm": 0}
+    case("lamb", "the trust ratio: a norm for each tensor; bias_correction_missing; decay_in_moment", p, g, **common)
+    case("lamb_without_decay", "without weight decay the trust ratio is left out, as in ODT's code", p, g,
+         **dict(common, weight_decay=0))
+    case("lamb_always_adapt", "and kept if asked for", p, g, always_adapt=1, **dict(common, weight_decay=0))
+    case("adamw", "AdamW: the decay goes past the moments and is not in the step's norm", p, g, optimizer="adamw", **common)
+    case("adam", "Adam on one number, as on log lambda: bias correction, epsilon outside the root",
+         {"log_temperature": [-2.25]}, {"log_temperature": np.array([[0.5], [-0.25], [2.0**-20], [0.0], [0.75]])},
+         optimizer="adamw", learning_rate=1e-4, weight_decay=0, clip_norm=0)
+    case("clip", "the clip counts all tensors together, once", p, gradients_of(shapes, 3, 4.0), **dict(common, clip_norm=0.25))
+    one = {"a": np.zeros((1, 4)) + [[0.1875, 0.125, 0.0, 0.0]]}
+    length = math.hypot(0.1875, 0.125)
+    three = lambda x: {"a": np.float64(np.float32(np.stack([one["a"][0] * x] * 2)))}
+    q = {"a": paint(3, 4)}
+    case("norm_below_clip", "just below the clip the gradient stays as it is", q, three((0.25 - 2e-6) / length),
+         **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
+    case("norm_above_clip", "just above it is scaled by clip / (norm + 1e-6)", q, three((0.25 + 1e-3) / length),
+         **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
+    case("norm_far_above_clip", "a norm of a hundred times the clip", q, three(100.0),
+         **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
+    case("zero_gradient", "a gradient of zero: the moments decay, the decay of weights goes on", p,
+         {k: np.concatenate([v[:1], 0 * v[:2]]) for k, v in g.items()}, **common)
+    case("zero_throughout", "never a gradient: 0 / (0 + epsilon)", p, {k: 0 * v[:2] for k, v in g.items()}, **common)
+    case("zero_weight_norm", "a tensor of zeros has trust ratio 1, at its first step", dict(p, **{"b.bias": np.zeros(5)}),
+         {k: v[:2] for k, v in g.items()}, **common)
+    case("no_decay_zero_weights", "zeros without weight decay", {"b.bias": np.zeros(5)}, {"b.bias": g["b.bias"][:2]},
+         **dict(common, weight_decay=0))
+    case("warmup", "linear warm-up: the first update has a fifth, the fifth and all later ones the whole", p,
+         gradients_of(shapes, 7), warmup_updates=5, **common)
+    f.save()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# sampling, normalize, gridworld
+
+
+def sampling():
+    f = File("sampling", "WODTEM sec. III-A: D_offline, D_online, first in, first out; sub-trajectories")
+
+    def case(name, note, lengths, returns_, order, context_length=3, draws=None, **settings):
+        """order: written out by hand. rewards: 0, but for a trajectory's last step."""
+        rewards = np.concatenate([np.eye(1, n, n - 1)[0] * r for n, r in zip(lengths, returns_)])
+        inputs = {"rewards": rewards, "lengths": np.array(lengths)}
+        outputs = {"order": np.array(order)}
+        steps = [(place, start) for place, i in enumerate(order) for start in range(lengths[i])]
+        if draws is None:
+            draws = list(range(len(steps)))
+        inputs["draws"] = np.array(draws)
+        chosen = [steps[d] for d in draws]
+        outputs["trajectory"] = np.array([place for place, _ in chosen])
+        outputs["start"] = np.array([start for _, start in chosen])
+        outputs["length"] = np.array([min(context_length, lengths[order[place]] - start) for place, start in chosen])
+        f.case(name, note, "exact: whole numbers", CLOSED + ", all steps written out", inputs, outputs,
+               context_length=context_length, **settings)
+
+    case("by_length", "a trajectory in proportion to its length, a start uniform over its steps, windows cut at the end",
+         [4, 1, 6], [1.0, 2.0, 3.0], [0, 1, 2])
+    case("one_trajectory", "one trajectory of one step", [1], [1.0], [0])
+    case("context_one", "C = 1", [2, 3], [1.0, 2.0], [0, 1], 1)
+    case("sorted_start", "sorted_start: the buffer begins sorted from low to high return, equal ones in order of the data",
+         [2, 3, 1, 2], [5.0, -1.0, 5.0, 2.0], [1, 3, 0, 2])
+    case("best_stay", "where the data set is larger than the buffer, the highest returns stay; of equal ones the later",
+         [2, 3, 1, 2], [5.0, -1.0, 2.0, 2.0], [3, 0], capacity=2)
+    case("overwrite_order", "overwrite_order: full by one: the lowest offline return goes first, then place by place",
+         [1, 2, 3, 4, 5], [3.0, 1.0, 2.0, 0.0, 0.0], [3, 4, 0], initial=3, capacity=3)
+    case("fills_up", "a buffer that is not full takes in new trajectories behind the old", [1, 2, 3], [3.0, 1.0, 9.0],
+         [1, 0, 2], initial=2, capacity=4)
+    case("laps", "lap after lap", [1, 2, 3, 4, 5, 6], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [4, 5], initial=2, capacity=2)
+    case("drops_lowest", "ODT's code drops the offline trajectory of the lowest return, of several the first",
+         [2, 3, 1, 2], [5.0, -1.0, -1.0, 2.0], [2, 3, 0], keep_lowest=0)
+    f.save()
+
+
+def normalize():
+    f = File("normalize", "none: D4RL's normalised score; ODT's normalised states")
+    scores = {"hopper": (-20.272305, 3234.3), "walker2d": (1.629008, 4592.3), "halfcheetah": (-280.178953, 12135.0),
+              "ant": (-325.6, 3879.7), "maze2d-umaze": (23.85, 161.86), "maze2d-medium": (13.13, 277.39),
+              "maze2d-large": (6.7, 273.99), "antmaze-umaze": (0.0, 1.0)}
+    for task, (low, high) in scores.items():
+        f.case("score_" + task.replace("-", "_"), "the two reference returns of the task are 0 and 100, and the middle is 50",
+               "float64 1e-12: three operations in double", "published: D4RL's reference scores",
+               {"returns": np.array([low, high, (low + high) / 2, 0.0])},
+               {"score": np.array([0.0, 100.0, 50.0, 100 * (0 - low) / (high - low)])}, task=task)
+
+    def case(name, note, states):
+        mean, deviation = states.mean(0), np.sqrt(((states - states.mean(0))**2).mean(0)) + 1e-6
+        worst = float(max(1.0, (np.abs(states).max(0) / deviation).max()))
+        y = (states - mean) / deviation
+        f.case(name, note, f"float32 {2 * U:.2g}: computed in double, rounded once", NUMPY, {"states": states},
+               {"mean": mean, "deviation": deviation, "normalised": y})
+        f.tolerance(name, "normalised", f"float32 {4 * worst * U / max(1e-9, np.abs(y).max()):.2g}, absolute 1e-12: float32 states less a "
+                    "rounded mean: what cancels is lost")
+
+    case("states", "population deviation (1/n), 1e-6 added to it, not under the root", paint(1, 12, 3))
+    constant = paint(1, 6, 3)
+    constant[:, 1] = 0.75
+    case("constant_dimension", "a dimension that never changes has deviation 1e-6, and is 0", constant)
+    case("one_state", "one state", paint(1, 1, 2))
+    f.save()
+
+
+MOVES = [(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)]  # R D L U R-D R-U L-D L-U
+
+
+def grid_next(cell, move, edge):
+    row, column = cell // 6 + MOVES[move][0], cell % 6 + MOVES[move][1]
+    if edge == "wraps":
+        return row % 6 * 6 + column % 6
+    if edge == "clipped":
+        return min(max(row, 0), 5) * 6 + min(max(column, 0), 5)
+    return row * 6 + column if 0 <= row < 6 and 0 <= column < 6 else cell
+
+
+def gridworld():
+    f = File("gridworld", "WODTEM sec. IV-A")
+    cells, moves = [x.ravel() for x in np.meshgrid(np.arange(36), np.arange(8), indexing="ij")]
+    for edge, note in (("clipped", "per-axis clipping: a diagonal slides along the wall; rows and columns exchanged"),
+                       ("stays", "a move off the grid is void as a whole"), ("wraps", "a torus"),
+                       ("excluded", "a move off the grid, should a policy choose one, is void")):
+        f.case("all_moves_" + edge, note, "exact: whole numbers", SEARCH, {"cell": cells, "move": moves},
+               {"next_cell": np.array([grid_next(c, m, edge) for c, m in zip(cells, moves)])}, edge=edge)
+    on = cells != 35
+    after = np.array([grid_next(c, m, "clipped") for c, m in zip(cells[on], moves[on])])
+    for encoding, state in (("coordinates", np.stack([after // 6, after % 6], 1).astype(np.float64)),
+                            ("one_hot", np.eye(36)[after].astype(np.uint8))):
+        f.case("all_steps_" + encoding, "reward 1 on arriving at the goal alone, where the episode ends; the state after the move",
+               "exact: whole numbers", SEARCH, {"cell": cells[on], "move": moves[on]},
+               {"next_cell": after, "reward": (after == 35).astype(np.float64), "terminated": (after == 35).astype(np.int64),
+                "state": state}, encoding=encoding)
+    path = [0, 7, 14, 21, 28]
+    f.case("shortest_path", "the shortest path has five steps, all R-D; the first four do not arrive", "exact: whole numbers", SEARCH,
+           {"cell": np.array(path), "move": np.full(5, 4)},
+           {"next_cell": np.array(path[1:] + [35]), "reward": np.array([0.0, 0, 0, 0, 1]),
+            "terminated": np.array([0, 0, 0, 0, 1])})
+    for behaviour, sideways in (("right_down", 0), ("left_down", 2)):
+        for edge in ("clipped", "stays", "wraps", "excluded"):
+            P = np.zeros((36, 36))
+            for cell in range(35):
+                share = np.array([0.2 if m in (sideways, 1) else 0.1 for m in range(8)])
+                if edge == "excluded":
+                    inside = [0 <= cell // 6 + r < 6 and 0 <= cell % 6 + c < 6 for r, c in MOVES]
+                    share = share * inside / (share * inside).sum()
+                for m in range(8):
+                    P[cell, grid_next(cell, m, edge)] += share[m]
+            P[35, 35] = 1
+            alive = [1 - np.linalg.matrix_power(P, t)[0, 35] for t in range(101)]
+            length = sum(alive[:100])
+            square = sum((2 * t + 1) * alive[t] for t in range(100))
+            p = 1 - alive[100]
+            f.case(f"chain_{behaviour}_{edge}", "the behaviour policy's mean length and return, by powers of the transition matrix",
+                   "float64 1e-12: a hundred sums of 36 probabilities", CLOSED, {},
+                   {"mean_length": np.array(length), "mean_return": np.array(p),
+                    "sd_length": np.array(math.sqrt(square - length**2)), "sd_return": np.array(math.sqrt(p * (1 - p)))},
+                   behaviour=behaviour, edge=edge)
+            f.tolerance(f"chain_{behaviour}_{edge}", "sd_length", "float64 1e-11: the square of the mean is subtracted")
+    f.save()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# step: whole updates
+
+
+def step():
+    f = File("step", "WODTEM eq. (1) to (3), (8) to (10), and the network, its gradients and both optimisers")
+
+    def case(name, note, head="gaussian", lengths=(4, 2, 3), w=None, layers=2, heads=2, d=8, state_dim=3, action_dim=2,
+             positions=0, updates=10, optimizer="lamb", held=(1, 10), lr=0.015625, wd=0.0078125, warmup=4, clip=0.25,
+             eta=None, full=False, timesteps=None):
+        n, windows = sum(lengths), len(lengths)
+        p = painted_parameters(parameter_shapes(state_dim, action_dim, layers, d, head, positions))
+        R, s = paint(11, n), paint(1, n, state_dim)
+        t = np.concatenate([np.arange(m) + 2 * i for i, m in enumerate(lengths)])
+        if head == "categorical":
+            actions, remembered = (np.arange(n) * 3) % action_dim, (np.arange(n) * 2 + 1) % action_dim
+            a = np.eye(action_dim)[actions]
+        else:
+            actions, remembered = paint(50, n, action_dim), paint(77, n, action_dim)
+            a = actions
+        w = np.where(np.arange(n) % 3 == 1, 0.75, 1.0) if w is None else w
+        noise = np.stack([paint(200 + 41 * u, n, action_dim, scale=2.0) for u in range(updates)])
+        log_lambda, eta = float(np.float32(math.log(0.1))), -float(action_dim) if eta is None else eta
+        inputs = {"parameter/" + k: v.detach().clone() for k, v in p.items()}
+        shape = (lambda x: x.reshape(windows, lengths[0], *x.shape[1:])) if full else (lambda x: x)
+        inputs.update({"returns_to_go": shape(R), "states": shape(s), "actions": shape(actions)})
+        if not full:
+            inputs["lengths"] = np.array(lengths)
+        if head != "deterministic":
+            inputs.update({"remembered_actions": shape(remembered), "weights": shape(w),
+                           "log_temperature": np.float64(log_lambda)})
+        if positions:
+            inputs["timesteps"] = shape(t)
+        if head == "gaussian":
+            inputs["noise"] = np.stack([shape(x) for x in noise])
+        theta, temperature = PeerOptimizer(optimizer, lr, wd, clip, warmup), PeerOptimizer("adamw", 0.03125, 0, 0)
+        lists = {"loss": [], "L": [], "H": [], "gradient_norm": [], "log_temperature": []}
+        outputs = {}
+        state = {"log_temperature": np.array([log_lambda])}
+        batch = split_windows(lengths, R, s, a, t)
+        for u in range(1, updates + 1):
+            layer, rows = network(p, batch, heads)
+            if u == 1:
+                for parts in layer.values():
+                    for part in parts:
+                        part.retain_grad()
+            policy = [torch.cat(layer[x]) for x in ("policy.mean", "policy.log_std") if x in layer]
+            L, H, loss = objective_of(head, policy, actions, remembered if head != "deterministic" else actions,
+                                      w if head != "deterministic" else np.ones(n), lengths, noise[u - 1],
+                                      math.exp(state["log_temperature"][0]))
+            loss.backward()
+            g = {k: v.grad.numpy() for k, v in p.items()}
+            if u == 1:
+                outputs.update({"gradient/" + k: x.copy() for k, x in g.items()})
+                for x in layer if updates == 10 else ():
+                    outputs["layer/" + x] = packed(layer[x], rows[x])
+                    outputs["layer_gradient/" + x] = packed([part.grad for part in layer[x]], rows[x])
+            values = {k: v.detach().numpy().copy() for k, v in p.items()}
+            lists["gradient_norm"].append(theta.step(values, g))
+            lists["loss"].append(float(loss))
+            lists["L"].append(float(L))
+            if H is not None:
+                slope = math.exp(state["log_temperature"][0]) * (float(H) - eta)
+                temperature.step(state, {"log_temperature": np.array([slope])})
+                lists["H"].append(float(H))
+                lists["log_temperature"].append(float(state["log_temperature"][0]))
+            p = {k: torch.tensor(v, requires_grad=True) for k, v in values.items()}
+            if u in held:
+                outputs.update({f"after_{u}/{k}": np.float32(v) for k, v in values.items()})
+        outputs.update({k: np.array(v) for k, v in lists.items() if v})
+        chain = 2 + state_dim + layers * (2 * (d + 8) + 4 * d + d // heads + 3 * max(lengths)) + d
+        k = 2 * chain
+        settings = {"heads": heads, "optimizer": optimizer, "learning_rate": lr, "weight_decay": wd, "warmup_updates": warmup,
+                    "clip_norm": clip}
+        if head != "deterministic":
+            settings.update({"lambda_learning_rate": 0.03125, "eta": eta})
+        f.case(name, note, f"float64 1e-12, float32 {k * U:.2g}: {k} roundings on the longest way there and back", TORCH, inputs,
+               outputs, **settings)
+        f.tolerance(name, "gradient", f"float64 1e-10, float32 {4 * k * U:.2g}: what cancels in sums over rows is four times as large")
+        if updates == 10:
+            f.tolerance(name, "layer_gradient", f"float64 1e-10, float32 {4 * k * U:.2g}: as gradient")
+        for u in held:
+            f.tolerance(name, f"after_{u}", f"float32 {max(4 * U, 8 * k * U * lr * u):.2g}: a parameter moves by the learning rate "
+                        f"times its own norm, {u} times, each by a quotient of gradients")
+            for layer in range(layers):
+                f.tolerance(name, f"after_{u}/transformer.h.{layer}.attn.c_attn.bias",
+                            f"float32 {lr * u:.2g}: the gradient of the keys' bias is 0 (softmax does not see it), and the step "
+                            "is rounding over rounding: only its size is bounded")
+        for x in ("loss", "L", "H", "gradient_norm", "log_temperature"):
+            if lists[x]:
+                f.tolerance(name, x, f"float64 1e-12, float32 {4 * k * U:.2g}: as the case, after up to {updates} updates")
+
+    case("tiny", "ten whole updates: any mistake that the other files miss; which tensor is wrong first says where")
+    case("alpha_one", "plain ODT: all weights 1, full windows given as [windows, C, ...], no lengths", lengths=(3, 3),
+         w=np.ones(6), layers=1, full=True, updates=2, held=(2,))
+    case("grid", "the grid world's shape: C = 1, moves, no weight decay: Adam's step without a trust ratio", "categorical",
+         (1, 1, 1, 1), layers=1, heads=1, action_dim=8, state_dim=2, wd=0, eta=-1.0, updates=2, held=(2,))
+    case("positions", "a table of positions, clipped at its end; its rows without a time-step get no gradient", positions=4, layers=1,
+         lengths=(3, 2), updates=1, held=(1,))
+    case("dt", "DT: tanh, squared error, AdamW, no temperature", "deterministic", (2, 3), layers=1, heads=1, positions=6,
+         optimizer="adamw", updates=2, held=(2,))
+    f.save()
+
+
 TOPICS = [rng, returns, linear, layernorm, mlp, attention, tokens, policy_gaussian, policy_discrete,
-          policy_deterministic]
+          policy_deterministic, memory_update, memory_lookup, memory_action, weights, objective, optimizer, sampling,
+          normalize, gridworld, step]
 
 if __name__ == "__main__":
     for make in TOPICS:
