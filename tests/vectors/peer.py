@@ -1329,9 +1329,312 @@ def step():
     f.save()
 
 
+# ----------------------------------------------------------------------------------------------------------------------
+# env_TASK: gym's and D4RL's rules around MuJoCo's own library, which a few lines of C open to Python. The robots' models
+# are data/*.xml (the tests hold every number of them against tables); mazes are written here from their maps.
+
+SHIM = r"""
+#include <mujoco/mujoco.h>
+static void quiet(const char* text) { (void)text; }
+void* load(const char* path, char* error) { mju_user_warning = quiet; return mj_loadXML(path, 0, error, 500); }
+void* make(mjModel* m) { return mj_makeData(m); }
+int size(mjModel* m, int what) { return what == 0 ? m->nq : what == 1 ? m->nv : what == 2 ? m->nu : 6 * m->nbody; }
+double* of_model(mjModel* m, int what) { return what == 0 ? m->qpos0 : what == 1 ? m->actuator_ctrlrange : &m->opt.timestep; }
+double* of_data(mjData* d, int what) {
+    return what == 0 ? d->qpos : what == 1 ? d->qvel : what == 2 ? d->ctrl : what == 3 ? d->xpos : d->cfrc_ext;
+}
+void reset(mjModel* m, mjData* d) { mj_resetData(m, d); }
+void forward(mjModel* m, mjData* d) { mj_forward(m, d); }
+void step(mjModel* m, mjData* d) { mj_step(m, d); }
+"""
+MAPS = {"maze2d-umaze": "11111 1G001 11101 10001 11111",
+        "maze2d-medium": "11111111 10011001 10010001 11000111 10010001 10100101 100010G1 11111111",
+        "maze2d-large": "111111111111 100001000001 101101010101 100000010001 101111011101 100101000001 110101010111 "
+                        "100100010G01 111111111111",
+        "antmaze-umaze": "11111 1R001 11101 1G001 11111"}
+
+
+def walls(task):
+    return [(i, j) for i, row in enumerate(MAPS[task].split()) for j, c in enumerate(row) if c == "1"]
+
+
+def maze2d_xml(task):
+    boxes = "".join(f'<geom type="box" size=".5 .5 .2" pos="{i + 1} {j + 1} 0"/>' for i, j in walls(task))
+    return f"""<mujoco><option timestep="0.01" gravity="0 0 0" iterations="20" integrator="Euler"/>
+    <size njmax="500" nconmax="100"/>
+    <default><geom friction=".5 .1 .1" density="1000" margin="0.002" condim="1" contype="2" conaffinity="1"/></default>
+    <worldbody><geom type="plane" pos="0 0 -0.1" size="40 40 .25" contype="1" conaffinity="0"/>{boxes}
+    <body pos="1.2 1.2 0"><joint name="a" type="slide" axis="1 0 0" damping="1"/>
+    <joint name="b" type="slide" axis="0 1 0" damping="1"/><geom type="sphere" size="0.1" contype="1"/></body></worldbody>
+    <actuator><motor joint="a" gear="100" ctrllimited="true" ctrlrange="-1 1"/>
+    <motor joint="b" gear="100" ctrllimited="true" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def antmaze_xml(ant):
+    boxes = "".join(f'<geom type="box" size="2 2 1" pos="{4 * (j - 1)} {4 * (i - 1)} 1" conaffinity="1"/>'
+                    for i, j in walls("antmaze-umaze"))
+    for old, new in (('timestep="0.01"', 'timestep="0.02"'), ('margin="0.01"/>', 'margin="0.01" solimp="0.8 0.8 0.01"/>'),
+                     ('ctrlrange="-1 1" gear="150"', 'ctrlrange="-30 30" gear="1"'), ("</worldbody>", boxes + "</worldbody>")):
+        assert ant.count(old) == 1, old
+        ant = ant.replace(old, new)
+    return ant
+
+
+class Engine:
+    def __init__(self, task, library):
+        import ctypes
+        import tempfile
+        self.task, self.c = task, library
+        name = {"antmaze-umaze": "ant"}.get(task, task)
+        if task.startswith("maze2d"):
+            xml = maze2d_xml(task)
+        else:
+            with open(os.path.join(HERE, "..", "..", "data", name + ".xml")) as file:
+                xml = file.read()
+            if task.startswith("antmaze"):
+                xml = antmaze_xml(xml)
+        with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+            file.write(xml)
+            file.flush()
+            error = ctypes.create_string_buffer(500)
+            self.m = ctypes.c_void_p(library.load(file.name.encode(), error))
+            assert self.m.value, error.value
+        self.d = ctypes.c_void_p(library.make(self.m))
+        self.nq, self.nv, self.nu, nforce = [library.size(self.m, i) for i in range(4)]
+        array = lambda pointer, n: np.ctypeslib.as_array(pointer, (n,))
+        self.qpos, self.qvel, self.ctrl, self.xpos, self.cfrc = [array(library.of_data(self.d, i), n) for i, n in enumerate(
+            (self.nq, self.nv, self.nu, 6, nforce))]
+        self.qpos0 = array(library.of_model(self.m, 0), self.nq).copy()
+        self.range = array(library.of_model(self.m, 1), 2 * self.nu).reshape(-1, 2)
+        self.timestep = array(library.of_model(self.m, 2), 1)[0]
+        self.skip = {"hopper": 4, "walker2d": 4, "halfcheetah": 5, "ant": 5, "antmaze-umaze": 5}.get(task, 1)
+        maze = MAPS.get(task, "").split()
+        goals = [(i, j) for i, row in enumerate(maze) for j, c in enumerate(row) if c == "G"]
+        self.goal = None if not goals else np.array(goals[0], dtype=float) if task.startswith("maze2d") else \
+            4.0 * np.array([goals[0][1] - 1, goals[0][0] - 1])
+
+    def start(self, qpos, qvel):
+        self.c.reset(self.m, self.d)
+        self.qpos[:], self.qvel[:] = qpos, qvel
+        self.c.forward(self.m, self.d)
+
+    def observe(self):
+        t = self.task
+        v = np.clip(self.qvel, -10, 10) if t in ("hopper", "walker2d") else self.qvel
+        first = {"hopper": 1, "walker2d": 1, "halfcheetah": 1, "ant": 2}.get(t, 0)
+        parts = [self.qpos[first:], v] + ([np.clip(self.cfrc, -1, 1)] if t == "ant" else [])
+        return np.concatenate(parts)
+
+    def step(self, action):
+        """One action of a policy, in [-1, 1]: observation, reward, done."""
+        t, (low, high) = self.task, self.range.T
+        if t.startswith("maze2d"):
+            a = np.clip(action, -1, 1)
+            self.qvel[:] = np.clip(self.qvel, -5, 5)
+            self.c.forward(self.m, self.d)
+        else:
+            a = np.clip(low + (np.asarray(action) + 1.0) * 0.5 * (high - low), low, high)
+        before = self.xpos[3] if t == "ant" else self.qpos[0]
+        self.ctrl[:] = a
+        for _ in range(self.skip):
+            self.c.step(self.m, self.d)
+        q, v = self.qpos, self.qvel
+        if self.goal is not None:
+            there = math.dist(q[:2], self.goal) <= 0.5
+            return self.observe(), float(there), there and t.startswith("antmaze")
+        after = self.xpos[3] if t == "ant" else q[0]
+        speed = (after - before) / (self.timestep * self.skip)
+        finite = np.isfinite(q).all() and np.isfinite(v).all()
+        if t == "hopper":
+            rest = np.concatenate([q, v])[2:]
+            return self.observe(), speed + 1 - 1e-3 * (a**2).sum(), not (
+                finite and (np.abs(rest) < 100).all() and q[1] > 0.7 and abs(q[2]) < 0.2)
+        if t == "walker2d":
+            return self.observe(), speed + 1 - 1e-3 * (a**2).sum(), not (0.8 < q[1] < 2.0 and -1.0 < q[2] < 1.0)
+        if t == "halfcheetah":
+            return self.observe(), speed - 0.1 * (a**2).sum(), False
+        contact = 0.5e-3 * (np.clip(self.cfrc, -1, 1)**2).sum()
+        return self.observe(), speed + 1 - 0.5 * (a**2).sum() - contact, not (finite and 0.2 <= q[2] <= 1.0)
+
+
+def environments():
+    import ctypes
+    import subprocess
+    import tempfile
+    folder = tempfile.mkdtemp()
+    with open(folder + "/shim.c", "w") as file:
+        file.write(SHIM)
+    subprocess.run(["gcc", "-O1", "-shared", "-fPIC", folder + "/shim.c", "-o", folder + "/shim.so", "-lmujoco"], check=True)
+    library = ctypes.CDLL(folder + "/shim.so")
+    for name in ("load", "make"):
+        getattr(library, name).restype = ctypes.c_void_p
+    for name in ("of_model", "of_data"):
+        getattr(library, name).restype = ctypes.POINTER(ctypes.c_double)
+    for task in ("hopper", "walker2d", "halfcheetah", "ant", "maze2d-umaze", "maze2d-medium", "maze2d-large", "antmaze-umaze"):
+        environment(Engine(task, library))
+
+
+def environment(e):
+    task, nq, nv, nu = e.task, e.nq, e.nv, e.nu
+    f = File("env_" + task, "none: gym's and D4RL's task")
+    source = "peer: libmujoco 2.2.2 driven from Python, gym's and D4RL's rules written again"
+    near = "float64 1e-09, absolute 1e-09: the engine's own arithmetic, which differs between processors in the last bits"
+
+    def case(name, note, qpos, qvel, actions, expected=None, source_=source, tolerance=near, **more):
+        """qpos [m, nq], ...; actions [m, A] or [m, T, A]. expected: what is known without the engine."""
+        qpos, qvel, actions = np.atleast_2d(qpos), np.atleast_2d(qvel), np.asarray(actions, dtype=np.float64)
+        several = actions.ndim == 3
+        rows = []
+        for q, v, a in zip(qpos, qvel, actions if several else actions[:, None]):
+            e.start(q, v)
+            for action in a:
+                observation, reward, done = e.step(action)
+                rows.append((e.qpos.copy(), e.qvel.copy(), observation, reward, done))
+        outputs = {}
+        for i, key in enumerate(("qpos", "qvel", "observation", "reward", "terminated")):
+            x = np.array([row[i] for row in rows])
+            outputs[key] = x.reshape(*actions.shape[:-1], *x.shape[1:]) if i < 3 else x.reshape(actions.shape[:-1])
+        outputs["reward"] = outputs["reward"].astype(np.float64)
+        outputs["terminated"] = outputs["terminated"].astype(np.int32)
+        for key, x in (expected or {}).items():
+            assert np.allclose(outputs[key], x, rtol=1e-9, atol=1e-9), (task, name, key, outputs[key], x)
+            outputs[key] = np.array(x, dtype=outputs[key].dtype)
+        f.case(name, note, tolerance, source_, dict({"qpos": qpos, "qvel": qvel, "actions": actions}, **more), outputs)
+
+    if task.startswith("maze2d"):
+        return maze2d(e, f, case)
+    m = 4
+    qpos = np.tile(e.qpos0, (m, 1)) + paint(3, m, nq) * 0.05
+    qvel = paint(50, m, nv) * 0.5
+    if task == "antmaze-umaze":
+        e.goal = np.array([0.75, 8.5])
+    goal = {} if e.goal is None else {"goal": e.goal.copy()}
+    run = lambda *a, **k: case(*a, **dict(goal, **k))
+    run("start", "at rest: the bonus alone, no velocity, no cost", e.qpos0, np.zeros(nv), np.zeros((1, nu)))
+    run("moving", "order of actuators, of qpos and qvel; frame skip; cost of the action", qpos, qvel, paint(90, m, nu))
+    run("actions_beyond", "an action beyond its bounds is the bound, in the actuator and in the cost",
+        np.tile(qpos[:1], (2, 1)), np.tile(qvel[:1], (2, 1)), np.stack([np.full(nu, 1.5), np.full(nu, -4.0)]))
+    limits = {"hopper": [3, 4, 5], "walker2d": [3, 4, 8], "halfcheetah": [3, 5, 8]}.get(task, [7, 8, 14])
+    beyond = np.tile(qpos[:1], (len(limits), 1))
+    for i, joint in enumerate(limits):
+        beyond[i, joint] = e.qpos0[joint] + (2.0 if task == "halfcheetah" else 1.5)
+    run("joint_limit", "a joint beyond its limit is pushed back", beyond, np.zeros((len(limits), nv)),
+        np.zeros((len(limits), nu)))
+    # Contact: fallen for a while under painted actions, then from there anew.
+    states = []
+    e.start(qpos[1], qvel[1] * 0.1)
+    for i in range(40):
+        e.step(paint(7 * i, nu))
+        if i % 13 == 12:
+            states.append((e.qpos.copy(), e.qvel.copy()))
+    run("contact", "feet on the floor: friction, soft contact", [q for q, _ in states], [v for _, v in states],
+        paint(33, len(states), nu))
+    run("six_steps", "the control and the solver's warm start carry over; nothing is evaluated after the last engine step",
+        qpos[:1], qvel[:1], paint(77, 1, 6, nu))
+    fast = np.zeros(nv)
+    fast[[1, nv - 1]] = [12.0, -25.0]
+    run("fast", "velocities beyond 10: hopper's and walker2d's observation clips them, the others' does not", qpos[:1], fast,
+        np.zeros((1, nu)))
+
+    def threshold(name, note, index, start, inside, outside, velocity=False):
+        """Finds by halving where the step's end crosses the threshold, and stands a millionth to either side."""
+        q, v = e.qpos0.copy(), np.zeros(nv)
+        if start is not None:
+            q[:] = start
+
+        def ends(x):
+            q2, v2 = q.copy(), v.copy()
+            (v2 if velocity else q2)[index] = x
+            e.start(q2, v2)
+            return e.step(np.zeros(nu))[2], q2, v2
+        a, b = inside, outside
+        assert not ends(a)[0] and ends(b)[0], (task, name)
+        while abs(b - a) > 1e-9:
+            a, b = ((a + b) / 2, b) if not ends((a + b) / 2)[0] else (a, (a + b) / 2)
+        step = math.copysign(1e-6, outside - inside)
+        sides = [ends(a - step), ends(b + step)]
+        assert [s[0] for s in sides] == [False, True]
+        run(name, note, [s[1] for s in sides], [s[2] for s in sides], np.zeros((2, nu)))
+
+    if task == "hopper":
+        air = e.qpos0 + [0, 2.0, 0, 0, 0, 0]
+        bent = e.qpos0 + [0, -0.4, 0, -0.9, -1.4, 0.4]
+        threshold("height", "done at z <= 0.7, just above and just below", 1, bent, 0.9, 0.6)
+        threshold("pitch_up", "done at |pitch| >= 0.2", 2, air, 0.0, 0.5)
+        threshold("pitch_down", "done at |pitch| >= 0.2, the other side", 2, air, 0.0, -0.5)
+        threshold("speed", "done at a velocity of 100, unclipped", 5, air, 50.0, 250.0, True)
+    elif task == "walker2d":
+        air = e.qpos0 + [0, 0.4, 0, 0, 0, 0, 0, 0, 0]
+        threshold("height_high", "done at z >= 2", 1, None, 1.5, 2.5)
+        threshold("height_low", "done at z <= 0.8", 1, e.qpos0 + [0, 0, 0, -1.5, -2.0, 0, -1.5, -2.0, 0], 1.1, 0.6)
+        threshold("pitch_up", "done at pitch >= 1", 2, air, 0.5, 1.5)
+        threshold("pitch_down", "done at pitch <= -1", 2, air, -0.5, -1.5)
+    elif task == "halfcheetah":
+        over = e.qpos0.copy()
+        over[2] = math.pi
+        run("on_its_back", "never done", over, np.zeros(nv), np.zeros((1, nu)))
+    elif task == "ant":
+        threshold("height_high", "done at z > 1", 2, None, 0.9, 1.2)
+        low = e.qpos0.copy()
+        low[3:7] = [0, 1, 0, 0]  # on its back, pressed into the floor, which pushes it out
+        threshold("height_low", "done at z < 0.2", 2, low, 0.1, -0.3)
+        turned = np.tile(e.qpos0, (2, 1))
+        turned[:, 3:7] = [[2.0, 0.0, 0.0, 0.0], [0.0, 3.0, 0.0, 4.0]]
+        run("quaternion", "a quaternion of another length is normalised", turned, np.zeros((2, nv)), np.zeros((2, nu)))
+    else:
+        q = np.tile(e.qpos0, (3, 1))
+        q[:, :2] = [[0.75, 8.5], [0.75 - 0.49, 8.5], [0.75 - 0.51, 8.5]]
+        run("goal", "paid and over within half a metre of the goal", q, np.zeros((3, nv)), np.zeros((3, nu)),
+            {"reward": [1, 1, 0], "terminated": [1, 1, 0]})
+        q = np.tile(e.qpos0, (2, 1))
+        q[:, 2] = [0.1, 1.5]
+        run("fallen", "a fall ends nothing", q, np.zeros((2, nv)), np.zeros((2, nu)), {"terminated": [0, 0]})
+        q = np.tile(e.qpos0, (2, 1))
+        q[:, 0], q[:, 1] = [1.5, 5.5], [0.0, 8.0]
+        run("walls", "a leg against a wall; columns are x, rows are y", q, np.zeros((2, nv)), paint(5, 2, nu))
+    f.save()
+
+
+def maze2d(e, f, case):
+    """A ball of 4/3 pi 0.1^3 1000 kg, damping 1, pushed by 100 N, Euler with implicit damping."""
+    mass, dt = 4 / 3 * math.pi * 0.1**3 * 1000, 0.01
+    exact = CLOSED + ": v' = v + dt (100 a - v) / (mass + dt), x' = x + dt v'"
+    goal = e.goal
+    free = [(i, j) for i, row in enumerate(MAPS[e.task].split()) for j, c in enumerate(row) if c != "1"]
+    m = 8
+    qpos = np.array([free[k * len(free) // m] for k in range(m)]) + paint(3, m, 2) * 0.125 - 0.2
+    qvel, actions = paint(50, m, 2), paint(90, m, 2)
+
+    def moved(x, v, a):
+        v = np.clip(v, -5, 5)
+        v = v + dt * (100 * np.clip(a, -1, 1) - v) / (mass + dt)
+        return x + dt * v, v
+
+    def free_case(name, note, x, v, a, **expected):
+        x1, v1 = moved(x, v, a)
+        reward = (np.hypot(*(x1 - goal).T) <= 0.5).astype(float)
+        case(name, note, x, v, a, dict({"qpos": x1, "qvel": v1, "observation": np.concatenate([x1, v1], 1), "reward": reward,
+                                        "terminated": np.zeros(len(x))}, **expected), exact,
+             "float64 1e-09, absolute 1e-09: the engine's solver stops at 1e-8 of the constraint that the floor is")
+
+    free_case("free", "free motion: damping, mass, order of x and y; no reward away from the goal", qpos, qvel, actions)
+    free_case("velocity_clip", "velocities are clipped to 5 before the step, not after", qpos[:2],
+              np.array([[8.0, -5.5], [-5.0, 6.0]]), np.array([[1.0, -1.0], [-1.0, 1.0]]))
+    free_case("actions_beyond", "an action beyond its bounds is the bound", qpos[:2], qvel[:2], np.array([[3.0, -2.0], [-1.5, 1.0]]))
+    away = np.array([0.0, 1.0] if e.task == "maze2d-umaze" else [0.0, -1.0])
+    at = np.stack([goal + away * 0.4995, goal + away * 0.5005, goal])  # of which the ball's wall may take it a little away
+    case("goal", "1 within half a metre of the goal cell's indices, on the goal too, and the episode goes on", at,
+         np.zeros((3, 2)), np.zeros((3, 2)), {"reward": [1, 0, 1], "terminated": np.zeros(3)})
+    # Above and left of the first free cell stand walls.
+    top = np.array(free[0]) - 0.2
+    case("wall", "a wall: soft contact, at the place that the map says (1.2 off the indices)", [top + [-0.4, 0.0], top + [0.0, -0.4]],
+         np.array([[-2.0, 0.5], [0.5, -2.0]]), np.array([[[-1.0, 0.25]] * 6, [[0.25, -1.0]] * 6]))
+    f.save()
+
+
 TOPICS = [rng, returns, linear, layernorm, mlp, attention, tokens, policy_gaussian, policy_discrete,
           policy_deterministic, memory_update, memory_lookup, memory_action, weights, objective, optimizer, sampling,
-          normalize, gridworld, step]
+          normalize, gridworld, step, environments]
 
 if __name__ == "__main__":
     for make in TOPICS:
