@@ -551,10 +551,34 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     }
 }
 
-// In double, for the gradient checks, the plain version is all there is.
-inline void matmul(Compute&, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
+// In double, for checks alone: matmul_plain's sums, a few rows at a time, along rows of B.
+inline void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
                    Store store) {
-    matmul_plain(c, a, b, M, N, K, store);
+    constexpr int block = 8;
+    const ptrdiff_t columns = N;
+    std::vector<double> untransposed(b.transposed ? static_cast<size_t>(K) * static_cast<size_t>(N) : 0);
+    for (int k = 0; b.transposed && k < K; ++k)
+        for (int j = 0; j < N; ++j) untransposed[static_cast<size_t>(k * columns + j)] = b(k, j);
+    const View<const double> rows_of_b = b.transposed ? View<const double>{untransposed.data(), N} : b;
+    compute.threads.run((M + block - 1) / block, [&](int task, int) {
+        std::vector<double> sums(static_cast<size_t>(block * columns));
+        const int first_row = task * block, rows = std::min(block, M - first_row);
+        for (int first = 0; first < std::max(K, 1); first += sum_block) {
+            std::fill(sums.begin(), sums.end(), 0.0);
+            for (int k = first; k < std::min(K, first + sum_block); ++k)
+                for (int i = 0; i < rows; ++i) {
+                    const double element = a(first_row + i, k), *row = &rows_of_b(k, 0);
+                    double* sum = &sums[static_cast<size_t>(i * columns)];
+                    for (int j = 0; j < N; ++j) sum[j] += element * row[j];
+                }
+            for (int i = 0; i < rows; ++i)
+                for (int j = 0; j < N; ++j) {
+                    double& to = c(first_row + i, j);
+                    to =
+                        (first == 0 && store == Store::overwrite ? 0 : to) + sums[static_cast<size_t>(i * columns + j)];
+                }
+        }
+    });
 }
 
 // Sum of a[i] * b[i] in 16 lanes, folded in a fixed tree; faster than one chain of additions, and as reproducible.
