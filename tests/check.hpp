@@ -29,9 +29,9 @@ Tolerance parse_tolerance(const std::string& text, const std::string& where) {
     std::replace_if(
         head.begin(), head.end(), [](char c) { return c == ',' || c == ';' || c == '('; }, ' ');
     bool found = false;
+    if (head.starts_with("exact")) return {true, 0, 0, 0};
     for (const std::string& part : split(head, ' ')) {
         const std::optional<double> x = to_number(part);
-        if (part == "exact") return {true, 0, 0, 0};
         if (x && *x >= 0) {
             found = true;
             if (word == "absolute") tolerance.absolute = *x;
@@ -43,8 +43,8 @@ Tolerance parse_tolerance(const std::string& text, const std::string& where) {
     }
     if (!found)
         fail("check.tolerance",
-             "%s is \"%s\"; it begins with exact, or with numbers: float64 1e-12, float32 1e-6, absolute 0: the reason",
-             where.c_str(), text.c_str());
+             "%s is %s; it begins with exact, or with numbers: float64 1e-12, float32 1e-6, absolute 0: the reason",
+             where.c_str(), json_string(text.substr(0, 80)).c_str());
     return tolerance;
 }
 
@@ -137,8 +137,9 @@ struct Case {
 
     void check_shape(const StoredTensor& tensor, const Shape& pattern) const {
         bool fits = tensor.shape.size() == pattern.size();
+        const uint64_t most = tensor.size == 0 ? 1 << 20 : (uint64_t{1} << 31) - 1;  // nothing may stand for billions
         for (size_t i = 0; fits && i < pattern.size(); ++i)
-            fits = tensor.shape[i] < (1u << 31) && (pattern[i] == any || pattern[i] == tensor.shape[i]);
+            fits = tensor.shape[i] <= most && (pattern[i] == any || pattern[i] == tensor.shape[i]);
         if (pattern.empty()) fits = tensor.size == about(tensor.dtype).size;  // a number may have any rank
         if (fits) return;
         std::string expected = shape_text(pattern);
@@ -206,10 +207,12 @@ struct Case {
             x = in<double>(setting, {}).values[0];
         } else if (text != file.metadata.end()) {
             const std::optional<double> parsed = to_number(text->second);
-            if (!parsed) fail("check.value", "%s is \"%s\", expected a number", place.c_str(), text->second.c_str());
+            if (!parsed)
+                fail("check.value", "%s is %s, expected a number", place.c_str(),
+                     json_string(text->second.substr(0, 80)).c_str());
             x = *parsed;
         } else if (fallback) {
-            return *fallback;
+            x = *fallback;
         } else {
             need("in/" + setting);
         }
@@ -232,8 +235,8 @@ struct Case {
         const std::vector<std::string> words = split(choices, '|');
         if (text == file.metadata.end()) return words[0];
         if (std::find(words.begin(), words.end(), text->second) == words.end())
-            fail("check.value", "%s: metadata entry %s is \"%s\", expected one of %s", file.path.c_str(),
-                 json_string(key).c_str(), text->second.c_str(), choices.c_str());
+            fail("check.value", "%s: metadata entry %s is %s, expected one of %s", file.path.c_str(),
+                 json_string(key).c_str(), json_string(text->second.substr(0, 80)).c_str(), choices.c_str());
         return text->second;
     }
 
@@ -334,6 +337,9 @@ struct Graph {
         variables.push_back(std::make_unique<Variable>(Variable{name, c.in<T>(name, pattern), {}}));
         Variable& v = *variables.back();
         v.gradient.resize(v.array.values.size());
+        if (v.array.back() < 1 || v.array.values.size() >= 1u << 31)
+            fail("check.shape", "%s: has shape %s, expected at least one column and less than 2^31 numbers",
+                 c.where(c.need("in/" + name)).c_str(), shape_text(v.array.shape).c_str());
         const bool row = v.array.shape.size() == 1;
         return {v.array.values.data(), v.gradient.data(), row ? 1 : v.array.extent(0), v.array.back()};
     }
@@ -499,9 +505,12 @@ void check_attention(Case& c) {
     const Tensor<T> q = graph.variable("q", {any, any}), k = graph.variable("k", shape_of(q.rows, q.columns)),
                     v = graph.variable("v", shape_of(q.rows, q.columns));
     const int heads = static_cast<int>(c.whole("heads", 1, 1, 1 << 20)), n = q.rows, d = q.columns;
-    if (d % heads != 0)
-        fail("check.value", "%s: case %s: %d columns cannot have %d heads", c.file.path.c_str(), c.name.c_str(), d,
-             heads);
+    const std::vector<int> lengths = lengths_of(c, n);
+    if (d % heads != 0 || n > 100000 || std::any_of(lengths.begin(), lengths.end(), [](int l) { return l > 4096; }))
+        fail("check.value",
+             "%s: case %s: %d columns, %d heads, %d rows: heads must divide columns, and there may be "
+             "100000 rows at most, 4096 in a sequence",
+             c.file.path.c_str(), c.name.c_str(), d, heads, n);
     // Keys and values as c_attn lays them: side by side.
     const Tensor<T> kv = graph.tape.make(n, 2 * d);
     const auto each = [=](auto&& f) {
@@ -517,7 +526,7 @@ void check_attention(Case& c) {
     std::vector<Span> spans;
     std::vector<int> position(static_cast<size_t>(n));
     std::iota(position.begin(), position.end(), 0);
-    for (const int length : lengths_of(c, n)) {
+    for (const int length : lengths) {
         const int first = spans.empty() ? 0 : spans.back().first_token + spans.back().tokens;
         spans.push_back({first, length, first, length});
     }
@@ -547,7 +556,10 @@ std::unique_ptr<Transformer<T>> read_model(Case& c) {
     config.state_dim = static_cast<int>(shape("embed_state.weight")[1]);
     config.action_dim = static_cast<int>(shape("embed_action.weight")[1]);
     config.width = static_cast<int>(shape("embed_state.weight")[0]);
-    while (names.contains("transformer.h." + std::to_string(config.layers) + ".attn.c_attn.weight")) ++config.layers;
+    const uint64_t d = static_cast<uint64_t>(config.width);
+    const auto fused = [&] { return "transformer.h." + std::to_string(config.layers) + ".attn.c_attn.weight"; };
+    for (; names.contains(fused()); ++config.layers)  // before anything so large is allocated
+        c.check_shape(c.need("in/parameter/" + fused()), {d, 3 * d});
     config.heads =
         static_cast<int>(c.whole("heads", config.layers > 0 ? std::nullopt : std::optional(1.0), 1, 1 << 20));
     if (names.contains("embed_ordering.weight"))
@@ -603,6 +615,11 @@ Windows read_windows(Case& c, const TransformerConfig& config) {
         batch.lengths.assign(windows.steps[0], states.extent(1));
     else
         batch.lengths = lengths_of(c, n);
+    const int longest = batch.lengths.empty() ? 0 : *std::max_element(batch.lengths.begin(), batch.lengths.end());
+    if (n < 1 || n > 1000000 || longest > 1000)
+        fail("check.value",
+             "%s: case %s: %d steps, %d in the longest window; there must be 1 to a million, and at most 1000",
+             c.file.path.c_str(), c.name.c_str(), n, longest);
     batch.returns_to_go = c.in<float>("returns_to_go", windows.steps).values;
     if (c.has("in/timesteps")) {
         const auto timesteps = c.whole_in("timesteps", windows.steps, 0, 1 << 30);
@@ -764,7 +781,8 @@ MemoryConfig memory_settings(Case& c, int state_dim, int action_dim, int project
     config.state_dim = state_dim;
     config.action_dim = action_dim;
     config.projected_dim = projected_dim;
-    config.capacity = static_cast<size_t>(c.whole("capacity", static_cast<double>(std::max<size_t>(n, 1)), 1, 1e8));
+    // More room than rows changes nothing.
+    config.capacity = std::min(n + 1, static_cast<size_t>(c.whole("capacity", static_cast<double>(n + 1), 1, 1e12)));
     config.K = static_cast<int>(c.whole("K", 1, 1, 100000));
     config.epsilon = c.number("epsilon", INFINITY, 0, INFINITY);
     config.tau = c.number("tau", 1, 1e-9, 1e9);
@@ -782,6 +800,7 @@ Table empty_table(Case& c) {
     const bool projects = c.has("in/projection");
     const Array<double> projection =
         projects ? c.in<double>("projection", {any, states.shape[1]}) : Array<double>{{0, 0}, {}};
+    check_finite("projection", projection.values.data(), projection.values.size());
     EpisodicMemory memory(memory_settings(c, states.extent(1), actions.extent(1), projection.extent(0), n), 0);
     memory.projection = projection.values;
     return {states, actions, e, std::move(memory)};
@@ -849,6 +868,9 @@ void check_memory_update(Case& c) {
 Neighbourhoods look_up(Case& c, const Table& table, uint64_t& m) {
     const auto query = c.in<float>("query", {any, table.states.shape[1]});
     m = query.shape[0];
+    if (m * static_cast<uint64_t>(table.memory.config.K) > 100000000)
+        fail("check.value", "%s: case %s: %llu queries of %d neighbours are more than 10^8", c.file.path.c_str(),
+             c.name.c_str(), static_cast<unsigned long long>(m), table.memory.config.K);
     return table.memory.search(query.values.data(), m);
 }
 
@@ -1000,6 +1022,8 @@ void check_optimizer(Case& c) {
     for (const std::string& name : c.named("in/parameter/")) {
         Shape shape = c.need("in/parameter/" + name).shape;
         const Array<float> value = c.in<float>("parameter/" + name, shape);
+        if (value.values.empty())
+            fail("check.shape", "%s: has no entry", c.where(c.need("in/parameter/" + name)).c_str());
         parameters.push_back({name, shape, value.values, std::vector<float>(value.values.size())});
         shape.insert(shape.begin(), steps);
         gradients.push_back(c.in<float>("gradient/" + name, shape));
@@ -1034,8 +1058,9 @@ void check_sampling(Case& c) {
     const size_t initial =
         static_cast<size_t>(c.whole("initial", static_cast<double>(count), 0, static_cast<double>(count)));
     const int context_length = static_cast<int>(c.whole("context_length", 20, 1, 1 << 30));
-    ReplayBuffer buffer{1,  1, 1.0, static_cast<size_t>(c.whole("capacity", static_cast<double>(count), 1, 1e9)),
-                        {}, 0, {}};
+    ReplayBuffer buffer{
+        1,  1, 1.0, static_cast<size_t>(c.whole("capacity", static_cast<double>(std::max<size_t>(count, 1)), 1, 1e9)),
+        {}, 0, {}};
     std::vector<Trajectory> trajectories;
     size_t at = 0;
     for (size_t i = 0; i < count; ++i) {
@@ -1055,7 +1080,8 @@ void check_sampling(Case& c) {
     for (const Trajectory& trajectory : buffer.trajectories) order.push_back(trajectory.states[0]);
     c.expect("order", {order.size()}, order);
     if (!c.has("in/draws")) return;
-    const auto draws = c.whole_in("draws", {any}, 0, static_cast<int64_t>(buffer.ends.back()) - 1);
+    const auto draws =
+        c.whole_in("draws", {any}, 0, buffer.ends.empty() ? -1 : static_cast<int64_t>(buffer.ends.back()) - 1);
     std::vector<int> trajectory, start, length;
     for (const int64_t draw : draws.values) {
         const Window window = buffer.window_at(static_cast<uint64_t>(draw), context_length);
@@ -1081,6 +1107,7 @@ void check_normalize(Case& c) {
         return c.expect("score", returns.shape, score);
     }
     const auto states = c.in<float>("states", {any, any});
+    if (states.values.empty()) fail("check.shape", "%s: has no entry", c.where(c.need("in/states")).c_str());
     Trajectory trajectory;
     trajectory.states = states.values;
     const Normaliser normaliser = fit_normaliser({trajectory}, states.extent(1));
@@ -1231,7 +1258,7 @@ void check_step(Case& c) {
         noise = c.in<float>("noise", shape).values;
     }
     Optimizer optimizer;
-    optimizer.updates = static_cast<uint64_t>(c.whole("updates_before", 0, 0, 0));
+
     Temperature temperature(1);
     temperature.log_lambda[0].value[0] = static_cast<float>(log_lambda);
     Tape<T> tape(c.compute);
@@ -1407,14 +1434,20 @@ std::vector<std::string> cases_of(const TensorFile& file) {
     }
     const std::string& count = file.text("cases");
     if (count != std::to_string(cases.size()))
-        fail("check.count", "%s: metadata entry \"cases\" says %s, the file has %zu", file.path.c_str(), count.c_str(),
-             cases.size());
+        fail("check.count", "%s: metadata entry \"cases\" says %s, the file has %zu", file.path.c_str(),
+             json_string(count.substr(0, 80)).c_str(), cases.size());
     return cases;
+}
+
+std::string printable(std::string text) {  // a file may not drive the terminal
+    for (char& c : text)
+        if (static_cast<unsigned char>(c) < ' ' || c == 0x7F) c = '?';
+    return text;
 }
 
 std::string entry(const Case& c, const char* what) {
     const auto found = c.file.metadata.find(c.name + "." + what);
-    return found == c.file.metadata.end() ? "" : found->second;
+    return found == c.file.metadata.end() ? "" : printable(found->second);
 }
 
 void print_inputs(const Case& c) {
@@ -1424,7 +1457,7 @@ void print_inputs(const Case& c) {
     for (const auto& [key, text] : c.file.metadata)
         if (key.starts_with(c.name + ".") && !key.ends_with(".note") && !key.ends_with(".source") &&
             !key.ends_with(".tolerance"))
-            std::printf("    %s = %s\n", key.substr(c.name.size() + 1).c_str(), text.c_str());
+            std::printf("    %s = %s\n", printable(key.substr(c.name.size() + 1)).c_str(), printable(text).c_str());
     for (const StoredTensor& tensor : c.file.tensors)
         if (tensor.name.starts_with(c.name + "/in/"))
             with_type(tensor.dtype, [&](auto type) {
@@ -1482,7 +1515,7 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
     std::vector<Case> failed;
     bool rounded = false;
     const std::vector<std::string> cases = cases_of(file);
-    if (verbose) std::printf("%s: topic %s\n", path.c_str(), name.c_str());
+    if (verbose) std::printf("%s: topic %s\n", path.c_str(), printable(name).c_str());
     for (const std::string& case_name : cases) {
         Case c{file, case_name, compute, verbose};
         try {
