@@ -61,24 +61,13 @@ struct Array {
 // Calls f with a value of the type that the tensor has in the file.
 template <class F>
 void with_type(DType dtype, F&& f) {
-    switch (dtype) {
-        case DType::F32:
-            return f(float{});
-        case DType::F64:
-            return f(double{});
-        case DType::U8:
-            return f(uint8_t{});
-        case DType::U32:
-            return f(uint32_t{});
-        case DType::U64:
-            return f(uint64_t{});
-        case DType::I32:
-            return f(int32_t{});
-        case DType::I64:
-            return f(int64_t{});
-        case DType::BOOL:
-            return f(uint8_t{});
-    }
+    if (dtype == DType::F32) return f(float{});
+    if (dtype == DType::F64) return f(double{});
+    if (dtype == DType::U32) return f(uint32_t{});
+    if (dtype == DType::U64) return f(uint64_t{});
+    if (dtype == DType::I32) return f(int32_t{});
+    if (dtype == DType::I64) return f(int64_t{});
+    return f(uint8_t{});  // U8, BOOL
 }
 
 std::string shown(long double x) {
@@ -240,7 +229,7 @@ struct Case {
         return text->second;
     }
 
-    // The tolerance of an output: metadata CASE.tolerance.NAME, NAME up to any slash, or CASE.tolerance.
+    // The tolerance of an output: metadata CASE.tolerance.NAME, NAME up to any slash, or CASE.tolerance, or tolerance.
     Tolerance tolerance(std::string output) {
         while (true) {
             const std::string key = name + ".tolerance" + (output.empty() ? "" : "." + output);
@@ -248,6 +237,8 @@ struct Case {
             const auto text = file.metadata.find(key);
             if (text != file.metadata.end())
                 return parse_tolerance(text->second, file.path + ": metadata entry " + json_string(key));
+            if (output.empty() && file.metadata.contains("tolerance"))
+                return parse_tolerance(file.text("tolerance"), file.path + ": metadata entry \"tolerance\"");
             if (output.empty()) return {};
             const size_t slash = output.rfind('/');
             output.resize(slash == std::string::npos ? 0 : slash);
@@ -1450,6 +1441,12 @@ std::string entry(const Case& c, const char* what) {
     return found == c.file.metadata.end() ? "" : printable(found->second);
 }
 
+// CASE.result: ok, or the id of the error that the case's inputs must raise.
+std::string expected_error(const Case& c) {
+    const std::string result = entry(c, "result");
+    return result == "ok" ? "" : result;
+}
+
 void print_inputs(const Case& c) {
     std::printf("  case %s\n", c.name.c_str());
     for (const char* what : {"note", "source", "tolerance"})
@@ -1470,11 +1467,9 @@ void print_inputs(const Case& c) {
 // A case is computed by every function that its topic has; what none of them asked for is an error.
 void check_case(Case& c, const Topic& topic) {
     if (c.verbose) print_inputs(c);
-    for (const char* what : {"note", "source"}) c.used.insert(c.name + "." + what);
+    for (const char* what : {"note", "source", "result"}) c.used.insert(c.name + "." + what);
     c.tolerance("");
-    bool has_output = false;
-    for (const StoredTensor& tensor : c.file.tensors) has_output |= tensor.name.starts_with(c.name + "/out/");
-    if (!has_output)
+    if (c.named("out/").empty() && expected_error(c).empty())
         fail("check.missing", "%s: case %s has no CASE/out/NAME: nothing is expected of it", c.file.path.c_str(),
              json_string(c.name).c_str());
     if (topic.in_float) {  // first: it finds out whether the inputs are floats
@@ -1521,9 +1516,11 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
         try {
             check_case(c, *topic);
         } catch (const Error& error) {
+            if (error.id == expected_error(c)) continue;
             if (error.id.starts_with("check.") || error.id.starts_with("safetensors.")) throw;
             fail(error.id.c_str(), "%s: case %s: %s", path.c_str(), json_string(case_name).c_str(), error.what());
         }
+        if (!expected_error(c).empty()) c.problems.push_back("expected the error " + expected_error(c) + ", none came");
         worst = std::max(worst, c.worst);
         rounded |= c.rounded;
         if (!c.problems.empty()) failed.push_back(c);

@@ -92,14 +92,6 @@ def tensor(x):
     return torch.tensor(np.asarray(x, dtype=np.float64), requires_grad=True)
 
 
-def roundings(k, magnitude, results, reason):
-    """A tolerance: k roundings of float32 in a row, of terms whose absolute values add up to `magnitude`, against the
-    largest of the results; float64 has the issue's own bounds."""
-    scale = min(float(torch.as_tensor(r).detach().abs().max()) for r in results)
-    bound = k * U * float(magnitude) / scale
-    return f"float64 1e-12, float32 {bound:.2g}: {reason}"
-
-
 def gradients(outputs, upstream, variables):
     """d(sum of upstream * output)/d(variable), by autograd."""
     loss = sum((torch.tensor(u) * y).sum() for y, u in zip(outputs, upstream))
@@ -358,7 +350,7 @@ def attention():
     case("causal_strict", "causal_strict: a token sees itself; a token sees what follows it", 4, 4, 2)
     case("neighbour_sequence_leak", "neighbour_sequence_leak: packed sequences see nothing of each other", 10, 8, 2,
          [1, 5, 3, 1])
-    case("huge_logits", "logits of +-80: exp without the largest subtracted overflows in float32 and, at 800, in float64",
+    case("huge_logits", "logits beyond +-80: exp without the largest subtracted overflows in float32 and, at 800, in float64",
          6, 4, 1, None, 64.0)
     # The largest logit lies beyond -10000: whoever adds -10000 to what is masked lets it through.
     case("mask_minus_10000", "mask_minus_10000: what is masked weighs exactly 0, however small the rest",
@@ -833,6 +825,9 @@ def memory_lookup():
          paint(7, 6) * 4, paint(13, 3, 8), projection, K=3, epsilon=8.0)
     case("projected_ties", "states that project to the same point are two entries at one distance", [[1.0, 2.0], [1.0, 5.0]],
          [1.0, 3.0], [[1.0, 7.0]], np.array([[1.0, 0.0]]), K=2)
+    for name, error, query in (("nan_query", "memory.not_finite", math.nan), ("infinite_query", "memory.not_finite", math.inf)):
+        f.case(name, "a state that is no number is an error, not a miss", "exact: an error", CLOSED,
+               memory_inputs([a, b], e[:2], [[query, 0.0]]), {}, result=error)
     case("repeated_state", "the same state twice in the table's history is one entry, with the higher e", [a, b, a],
          [1.0, 2.0, 6.0], [a], K=3)
     f.save()
@@ -874,6 +869,8 @@ def memory_action():
          [0.25, 1 - 2.0**-24], [0, 1], K=3, epsilon=0.25)
     case("order_of_distance", "the shares lie in order of distance, not of age", [[0.5], [0.25], [0.0]], [1.0, 1.0, 1.0],
          near * 3, [0.1, 0.5, 0.9], [2, 1, 0], K=3)
+    f.case("no_neighbour", "without a neighbour there is no action to remember: whoever asks makes an error", "exact: an error", CLOSED,
+           dict(memory_inputs(line, [1.0] * 3, [[9.0]]), uniform=np.array([0.5])), {}, epsilon=0.25, result="memory.no_neighbours")
     case("temperature", "tau divides e", line, [0.0, 10.0, 20.0], near * 2, [0.05, 0.2], [0, 1], K=3, tau=10.0)
     f.save()
 
@@ -996,6 +993,14 @@ def objective():
     case("dt", "DT: the squared error, no entropy term", [2, 2], np.ones(4), "deterministic")
     case("H_above_eta", "lambda falls when H is above eta", [3], np.ones(3), eta=-5.0)
     case("H_below_eta", "lambda rises when H is below eta: lambda_gradient_leaks, its sign", [3], np.ones(3), eta=5.0)
+    # H = log_std + log(2 pi) / 2 with mean and noise 0, and float32 takes -0.5 from it exactly.
+    at = float(np.float32(0.5 * math.log(2 * math.pi))) - 0.5
+    zero, half_down = np.zeros((1, 1)), np.full((1, 1), -0.5)
+    L = -gaussian_log_prob(torch.tensor(zero), torch.tensor(half_down), torch.tensor(zero + 0.25)).mean()
+    f.case("H_at_eta", "lambda rests when H is eta exactly (in float32)", "float64 1e-12, float32 1e-06: a dozen roundings", CLOSED,
+           {"mean": zero, "log_std": half_down, "actions": zero + 0.25, "noise": zero, "log_temperature": np.float64(-2.5)},
+           {"L": L, "H": np.array(0.5 * math.log(2 * math.pi) - 0.5), "log_temperature": np.float64(-2.5)}, eta=repr(at))
+    f.tolerance("H_at_eta", "log_temperature", "exact: no step")
     case("large_lambda", "padding_in_entropy; lambda times H, not log lambda times H", [2, 1], half(3), lam=4.0)
     f.save()
 
