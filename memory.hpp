@@ -146,7 +146,11 @@ struct ReplayBuffer {
     // gives both exactly: a trajectory owns `length` of the `total` numbers, each of them one start.
     Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length) const {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
-        const uint64_t step = random.below(ends.back(), update, window_index);
+        return window_at(random.below(ends.back(), update, window_index), context_length);
+    }
+
+    // The window that starts at a step, 0 <= step < ends.back(), of all trajectories laid end to end.
+    Window window_at(uint64_t step, int context_length) const {
         const auto end = std::upper_bound(ends.begin(), ends.end(), step);  // the first trajectory to end after `step`
         const int left = static_cast<int>(*end - step);
         const auto trajectory = static_cast<size_t>(end - ends.begin());

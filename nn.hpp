@@ -16,6 +16,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <functional>
 #include <memory>
 #include <new>
 #include <numeric>
@@ -825,12 +826,36 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     }
 }
 
-// In double, for the gradient checks, the plain version is all there is.
+// In double, for checks alone: matmul_plain's sums, a few rows at a time, along rows of B.
 template <class Before = Nothing, class After = Nothing>
-void matmul(Compute&, View<double> c, View<const double> a, View<const double> b, int M, int N, int K, Store store,
-            Before before = {}, After after = {}) {
+void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
+            Store store, Before before = {}, After after = {}) {
     before(Block{0, M, 0, N});
-    matmul_plain(c, a, b, M, N, K, store);
+    constexpr int block = 8;
+    const ptrdiff_t columns = N;
+    std::vector<double> untransposed(b.transposed ? static_cast<size_t>(K) * static_cast<size_t>(N) : 0);
+    for (int k = 0; b.transposed && k < K; ++k)
+        for (int j = 0; j < N; ++j) untransposed[static_cast<size_t>(k * columns + j)] = b(k, j);
+    const View<const double> rows_of_b = b.transposed ? View<const double>{untransposed.data(), N} : b;
+    compute.threads.run((M + block - 1) / block, [&](int task, int) {
+        std::vector<double> sums(static_cast<size_t>(block * columns));
+        const int first_row = task * block, rows = std::min(block, M - first_row);
+        for (int first = 0; first < std::max(K, 1); first += sum_block) {
+            std::fill(sums.begin(), sums.end(), 0.0);
+            for (int k = first; k < std::min(K, first + sum_block); ++k)
+                for (int i = 0; i < rows; ++i) {
+                    const double element = a(first_row + i, k), *row = &rows_of_b(k, 0);
+                    double* sum = &sums[static_cast<size_t>(i * columns)];
+                    for (int j = 0; j < N; ++j) sum[j] += element * row[j];
+                }
+            for (int i = 0; i < rows; ++i)
+                for (int j = 0; j < N; ++j) {
+                    double& to = c(first_row + i, j);
+                    to =
+                        (first == 0 && store == Store::overwrite ? 0 : to) + sums[static_cast<size_t>(i * columns + j)];
+                }
+        }
+    });
     after(Block{0, M, 0, N});
 }
 
@@ -912,6 +937,9 @@ struct Tape {
     size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: a fresh mask for each
+    // Told of each layer's output as soon as it is there (its memory may serve otherwise in backward()). Empty: no one
+    // watches.
+    std::function<void(const std::string& name, const Tensor<T>& output)> watch;
 
     explicit Tape(Compute& c) : compute(c) {}
 
@@ -929,8 +957,15 @@ struct Tape {
     // Where this tape adds up the gradient of a parameter.
     T* gradient(Tensor<T> parameter) const { return parameter.gradient + block * parameter.size(); }
 
+    // Shows `output` to whoever watches.
+    Tensor<T> show(const std::string& name, Tensor<T> output) const {
+        if (watch) watch(name, output);
+        return output;
+    }
+
     // An input: copied, without gradient.
-    Tensor<T> constant(const float* data, int rows, int columns) {
+    template <class Number>
+    Tensor<T> constant(const Number* data, int rows, int columns) {
         Tensor<T> x = {nullptr, nullptr, rows, columns};
         x.value = scratch<T>(x.size());
         std::copy_n(data, x.size(), x.value);
@@ -1630,9 +1665,11 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
                                   model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
     const DropoutAdd<T> add_x(dropout_at(tape, dropout_site(layer, 1), p),
                               all_ask ? x : select_rows(tape, x, rows, asked), d);
-    const Tensor<T> x1 = linear(tape, a, block.attn_proj, add_x);
+    const std::string name = "transformer.h." + std::to_string(layer);
+    const Tensor<T> x1 = tape.show(name + ".attn", linear(tape, a, block.attn_proj, add_x));
     const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{});
-    return linear(tape, hidden, block.mlp_proj, DropoutAdd<T>(dropout_at(tape, dropout_site(layer, 2), p), x1, d));
+    const DropoutAdd<T> add_x1(dropout_at(tape, dropout_site(layer, 2), p), x1, d);
+    return tape.show(name, linear(tape, hidden, block.mlp_proj, add_x1));
 }
 
 // y = -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
@@ -1687,18 +1724,22 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
 template <class T>
 Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Ask ask) {
     const TokenLayout layout = token_layout(batch, ask);
-    Tensor<T> x = layer_norm(tape, embed_tokens(tape, model, batch, layout), model.embed_ln,
-                             DropoutAdd<T>(dropout_at(tape, 0, model.config.dropout), {}, model.config.width));
+    Tensor<T> x = tape.show("embed", embed_tokens(tape, model, batch, layout));
+    const DropoutAdd<T> dropout(dropout_at(tape, 0, model.config.dropout), {}, model.config.width);
+    x = tape.show("embed_ln", layer_norm(tape, x, model.embed_ln, dropout));
     for (int layer = 0; layer < model.config.layers; ++layer) {
         const bool last = layer + 1 == model.config.layers;
         x = transformer_block(tape, model, layer, x, last ? layout.asked : layout.all,
                               last ? layout.asking : layout.every_token);
     }
-    x = layer_norm(tape, x, model.ln_f);
-    const Tensor<T> mean = linear(tape, x, model.predict_mean);
-    if (model.config.head == Head::categorical) return {log_softmax(tape, mean), {}};
-    if (model.config.head == Head::deterministic) return {tanh_of(tape, mean), {}};
-    return {mean, squash_log_std(tape, linear(tape, x, model.predict_log_std))};
+    x = tape.show("transformer.ln_f", layer_norm(tape, x, model.ln_f));
+    Policy<T> policy = {linear(tape, x, model.predict_mean), {}};
+    if (model.config.head == Head::categorical) policy.mean = log_softmax(tape, policy.mean);
+    if (model.config.head == Head::deterministic) policy.mean = tanh_of(tape, policy.mean);
+    tape.show("policy.mean", policy.mean);
+    if (model.config.head == Head::squashed_gaussian)
+        policy.log_std = tape.show("policy.log_std", squash_log_std(tape, linear(tape, x, model.predict_log_std)));
+    return policy;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1816,8 +1857,8 @@ Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* action
 }
 
 // sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
-template <class T>
-Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const float* coefficients) {
+template <class T, class Number>
+Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
     const Tensor<T> y = tape.make(1, 1), c = tape.constant(coefficients, x.rows, 1);
     y.value[0] = 0;
     for (int i = 0; i < x.rows; ++i) y.value[0] += c.value[i] * x.value[i];

@@ -666,7 +666,7 @@ struct Batch {
     std::vector<float> remembered;           // [n, action_dim] a-hat(s_c)
     std::vector<double> discounted_returns;  // [n] d_c
     std::vector<const float*> raw_states;    // [n] s_c, in the replay buffer
-    std::vector<float> mean;                 // [n] 1 / (batch_size |C^t|): over a window's steps, then windows
+    std::vector<double> mean;                // [n] 1 / (batch_size |C^t|): over a window's steps, then windows
     std::vector<float> weights;              // [n] w(s_c, a_c)
     std::vector<uint32_t> numbers;           // [n] window * context_length + step: who draws which random number
     Neighbourhoods neighbours;               // [n] K(s_c)
@@ -696,7 +696,7 @@ Batch sample_batch(const Run& run, uint32_t first_window, uint32_t end_window) {
             append_action(batch.actions, spec, action);
             batch.discounted_returns.push_back(trajectory.discounted_returns[step]);
             batch.raw_states.push_back(state);
-            batch.mean.push_back(1.0f / static_cast<float>(settings.batch_size * at.length));
+            batch.mean.push_back(1.0 / static_cast<double>(settings.batch_size * at.length));
             batch.numbers.push_back(window * context_length + c);
         }
     }
@@ -791,12 +791,12 @@ struct Objective {
 // Equations (2), (3), (8) to (10) for one batch. `entropy_noise` [n, action_dim]: for the Gaussian head only.
 template <class T>
 Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const Batch& batch,
-                       const float* entropy_noise, float lambda, bool constrain_entropy) {
-    const size_t n = batch.mean.size();
-    std::vector<float> observed(n), advised(n);
-    for (size_t i = 0; i < n; ++i) {
-        observed[i] = -batch.mean[i] * batch.weights[i];
-        advised[i] = -batch.mean[i] * (1.0f - batch.weights[i]);
+                       const float* entropy_noise, std::type_identity_t<T> lambda, bool constrain_entropy) {
+    const std::vector<T> mean(batch.mean.begin(), batch.mean.end()), w(batch.weights.begin(), batch.weights.end());
+    std::vector<T> observed(mean.size()), advised(mean.size());
+    for (size_t i = 0; i < mean.size(); ++i) {
+        observed[i] = -mean[i] * w[i];
+        advised[i] = -mean[i] * (T(1) - w[i]);
     }
     Objective<T> result;
     // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
@@ -811,22 +811,32 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     }
     // WODTEM eq. (3), WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
     // departs from ODT's code: over real steps only; ODT's code lets padding into this mean.
-    result.H = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), batch.mean.data());
+    result.H = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), mean.data());
     // WODTEM eq. (1), WODTEM eq. (8): theta descends L + lambda (eta - H-bar); lambda eta does not depend on theta.
-    result.lagrangian = combine(tape, T(1), result.L, T(-lambda), result.H);
+    result.lagrangian = combine(tape, T(1), result.L, -lambda, result.H);
+    return result;
+}
+
+// Forward, objective and backward of a batch, or of a part of it. The gradients are added to the model's.
+template <class T>
+Objective<T> learn(Tape<T>& tape, const Transformer<T>& model, const Batch& batch, const float* entropy_noise,
+                   std::type_identity_t<T> lambda, bool constrain_entropy) {
+    const Policy<T> policy = forward(tape, model, batch.sequences, Ask::every_state);
+    const Objective<T> result =
+        objective(tape, model.config.head, policy, batch, entropy_noise, lambda, constrain_entropy);
+    tape.backward(result.lagrangian);
     return result;
 }
 
 // WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar); by log lambda, whose gradient is the same number.
-void update_lambda(Run& run, double entropy) {
+void update_lambda(Compute& compute, Temperature& temperature, const Settings& settings, double entropy) {
     OptimizerConfig config;
     config.rule = OptimizerConfig::Rule::adamw;
-    config.learning_rate = run.agent.settings.lambda_learning_rate;
+    config.learning_rate = settings.lambda_learning_rate;
     config.weight_decay = config.clip_norm = 0;
     config.warmup_updates = 0;
-    run.temperature.log_lambda[0].gradient[0] =
-        static_cast<float>(-run.temperature.lambda() * (run.agent.settings.eta - entropy));
-    update_parameters(run.compute, run.temperature.log_lambda, run.temperature.optimizer, config);
+    temperature.log_lambda[0].gradient[0] = static_cast<float>(-temperature.lambda() * (settings.eta - entropy));
+    update_parameters(compute, temperature.log_lambda, temperature.optimizer, config);
 }
 
 // A part of the batch: its share of the objective, forward and backward.
@@ -849,17 +859,15 @@ void learn_part(Run& run, Part& part, uint32_t number) {
     part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
     consult_memory(run, part.batch);
 
-    const Head head = run.agent.model.config.head;
+    const bool gaussian = run.agent.model.config.head == Head::squashed_gaussian;
     std::vector<float> noise;
-    for (size_t i = 0; head == Head::squashed_gaussian && i < part.batch.actions.size(); ++i) {
+    for (size_t i = 0; gaussian && i < part.batch.actions.size(); ++i) {
         const size_t dim = static_cast<size_t>(run.agent.spec.action_dim);
         noise.push_back(run.random(Stream::entropy_noise)
                             .normal(run.progress.updates, part.batch.numbers[i / dim], static_cast<uint32_t>(i % dim)));
     }
-    const Policy<float> policy = forward(tape, run.agent.model, part.batch.sequences, Ask::every_state);
     const Objective<float> result =
-        objective(tape, head, policy, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
-    tape.backward(result.lagrangian);
+        learn(tape, run.agent.model, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
     part.loss = result.L.value[0];
     if (run.constrains_entropy()) part.entropy = result.H.value[0];
 }
@@ -890,7 +898,7 @@ void update(Run& run) {
         fail("nn.not_finite", "the loss (%g) or the entropy (%g) is not finite", loss, entropy);
     run.progress.gradient_norm +=
         update_parameters(run.compute, run.agent.model.parameters, run.optimizer, optimizer_config(run.agent.settings));
-    if (run.constrains_entropy()) update_lambda(run, entropy);
+    if (run.constrains_entropy()) update_lambda(run.compute, run.temperature, run.agent.settings, entropy);
     if (!std::isfinite(run.temperature.lambda())) fail("nn.not_finite", "lambda is not finite");
     run.progress.loss += loss;
     run.progress.entropy += entropy;
@@ -903,6 +911,20 @@ void update(Run& run) {
 
 enum class Act { sample, most_likely };  // online interaction; evaluation
 
+// a = tanh(u), as it is stored and stepped.
+float squashed_action(float u) { return clamp_action(std::tanh(u)); }
+
+// Of the log-probabilities of all moves: the most likely one (ties: the first); the one whose share of [0, 1) contains
+// `uniform`.
+int most_likely_move(const float* log_p, int moves) {
+    return static_cast<int>(std::max_element(log_p, log_p + moves) - log_p);
+}
+int sampled_move(const float* log_p, int moves, double uniform) {
+    int move = 0;
+    while (move + 1 < moves && (uniform -= static_cast<double>(std::exp(log_p[move]))) >= 0) ++move;
+    return move;
+}
+
 // The action of one row of the policy, as it is stored and stepped. Random: one stream, one number per dimension.
 std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act,
                                  const Random& random, uint64_t episode, uint32_t t) {
@@ -910,22 +932,16 @@ std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy
     const float* mean = policy.mean.value + static_cast<ptrdiff_t>(row) * columns;
     std::vector<float> action;
     if (agent.spec.moves > 0) {
-        if (act == Act::most_likely)
-            return {static_cast<float>(std::max_element(mean, mean + columns) - mean)};  // ties: the first
-        double left = random.uniform(episode, t);
-        int move = 0;
-        while (move + 1 < columns && (left -= static_cast<double>(std::exp(mean[move]))) >= 0) ++move;
-        return {static_cast<float>(move)};
+        if (act == Act::most_likely) return {static_cast<float>(most_likely_move(mean, columns))};
+        return {static_cast<float>(sampled_move(mean, columns, random.uniform(episode, t)))};
     }
     for (int i = 0; i < columns; ++i) {
         const ptrdiff_t at = static_cast<ptrdiff_t>(row) * columns + i;
         float u = mean[i];
-        if (agent.model.config.head == Head::squashed_gaussian) {
-            if (act == Act::sample)
-                u += std::exp(policy.log_std.value[at]) * random.normal(episode, t, static_cast<uint32_t>(i));
-            u = std::tanh(u);
-        }
-        action.push_back(clamp_action(u));
+        const bool gaussian = agent.model.config.head == Head::squashed_gaussian;
+        if (gaussian && act == Act::sample)
+            u += std::exp(policy.log_std.value[at]) * random.normal(episode, t, static_cast<uint32_t>(i));
+        action.push_back(gaussian ? squashed_action(u) : clamp_action(u));
     }
     return action;
 }
@@ -2166,6 +2182,7 @@ void command_tasks(const Arguments& arguments) {
 }
 
 #include "tests/bench.hpp"
+#include "tests/check.hpp"
 
 void command_bench(const Arguments& arguments) {
     choose_kernel(arguments["--kernel"]);  // refuses what the machine lacks
@@ -2261,6 +2278,13 @@ const std::vector<Command>& commands() {
          "updates: kernels beside the machine's peak, look-ups; environments: steps a second; random-policy",
          {kernel_option, threads_option, {"--json", nullptr, "", "of updates: print one JSON array"}},
          command_bench},
+        {"check",
+         "FILE...",
+         1,
+         10000,
+         "recompute golden vectors, ours or yours, and compare",
+         {{"-v", nullptr, "", "print inputs, expected and got"}, kernel_option, threads_option},
+         command_check},
         {"tasks",
          "[TASK]",
          0,

@@ -206,12 +206,13 @@ inline std::string hex8(uint32_t value) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tensors
 
-enum class DType : uint8_t { F32, F64, U8, U32, U64, I64 };
+enum class DType : uint8_t { F32, F64, U8, U32, U64, I32, I64, BOOL };
 struct DTypeInfo {
     const char* name;
     size_t size;  // bytes of one element
 };
-inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"U8", 1}, {"U32", 4}, {"U64", 8}, {"I64", 8}};
+inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"U8", 1},  {"U32", 4},
+                                       {"U64", 8}, {"I32", 4}, {"I64", 8}, {"BOOL", 1}};
 inline const DTypeInfo& about(DType dtype) { return dtypes[static_cast<size_t>(dtype)]; }
 
 template <class T>
@@ -221,6 +222,7 @@ consteval DType dtype_of() {
     if constexpr (std::is_same_v<T, uint8_t>) return DType::U8;
     if constexpr (std::is_same_v<T, uint32_t>) return DType::U32;
     if constexpr (std::is_same_v<T, uint64_t>) return DType::U64;
+    if constexpr (std::is_same_v<T, int32_t>) return DType::I32;
     if constexpr (std::is_same_v<T, int64_t>) return DType::I64;
 }  // any other type does not compile: no return
 
@@ -494,7 +496,7 @@ struct HeaderReader {
 inline DType dtype_named(const std::string& dtype, const std::string& tensor, const std::string& path) {
     for (size_t i = 0; i < std::size(dtypes); ++i)
         if (dtype == dtypes[i].name) return static_cast<DType>(i);
-    fail("safetensors.dtype", "%s: tensor %s has dtype %s, known are F32 F64 U8 U32 U64 I64; convert it first",
+    fail("safetensors.dtype", "%s: tensor %s has dtype %s, known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first",
          path.c_str(), json_string(tensor).c_str(), json_string(dtype.substr(0, 80)).c_str());
 }
 

@@ -324,7 +324,7 @@ TEST(lambda_falls_when_the_entropy_is_above_eta_and_rises_below) {
     for (const double entropy : {1.9, 1.1}) {
         Fixture f(settings);
         const double before = f.run.temperature.log_lambda[0].value[0];
-        update_lambda(f.run, entropy);
+        update_lambda(f.compute, f.run.temperature, f.run.agent.settings, entropy);
         CHECK_CLOSE(f.run.temperature.log_lambda[0].value[0] - before, entropy > 1.5 ? -1e-4 : 1e-4, 1e-6);
     }
 }

@@ -1,0 +1,1553 @@
+// check.hpp: `wodtem check FILE...`: recomputes golden vectors with the functions that training uses, and compares.
+// Included by wodtem.cpp. tests/vectors/README.md describes the files, well enough to write new ones by hand.
+//
+// In order: cases (inputs by name, outputs held against what the file expects, each within its stated tolerance); one
+// function for each topic, in porting order; the table of topics; files.
+// Promises: files are untrusted: what is missing, unknown, of another shape or not counted is a sentence with file,
+// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a case
+// is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
+#pragma once
+
+namespace vectors {
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Cases
+
+enum class Precision { float64, float32 };
+
+// |got - expected| <= bound * (largest |expected| of the tensor) + absolute; exact: equal numbers.
+struct Tolerance {
+    bool exact = false;
+    double float64 = 1e-10, float32 = 1e-5, absolute = 0;
+};
+
+// "exact: ...", "1e-12: ...", "float64 1e-12, float32 3e-6, absolute 1e-9: ...". A number without a word before it is
+// float64's, and float32's too where that can be so precise; what follows the colon is the reason.
+Tolerance parse_tolerance(const std::string& text, const std::string& where) {
+    Tolerance tolerance;
+    std::string head = text.substr(0, text.find(':')), word;
+    std::replace_if(
+        head.begin(), head.end(), [](char c) { return c == ',' || c == ';' || c == '('; }, ' ');
+    bool found = false;
+    if (head.starts_with("exact")) return {true, 0, 0, 0};
+    for (const std::string& part : split(head, ' ')) {
+        const std::optional<double> x = to_number(part);
+        if (x && *x >= 0) {
+            found = true;
+            if (word == "absolute") tolerance.absolute = *x;
+            if (word == "float32") tolerance.float32 = *x;
+            if (word != "absolute" && word != "float32") tolerance.float64 = *x;
+            if (word != "absolute" && word != "float32" && word != "float64" && *x > 0x1p-24) tolerance.float32 = *x;
+        }
+        if (!part.empty()) word = part;
+    }
+    if (!found)
+        fail("check.tolerance",
+             "%s is %s; it begins with exact, or with numbers: float64 1e-12, float32 1e-6, absolute 0: the reason",
+             where.c_str(), json_string(text.substr(0, 80)).c_str());
+    return tolerance;
+}
+
+constexpr uint64_t any = ~uint64_t{0};  // in a pattern of shapes
+
+template <class T>
+struct Array {
+    Shape shape;
+    std::vector<T> values;
+    int extent(size_t axis) const { return static_cast<int>(shape[axis]); }
+    int back() const { return static_cast<int>(shape.back()); }
+};
+
+// Calls f with a value of the type that the tensor has in the file.
+template <class F>
+void with_type(DType dtype, F&& f) {
+    if (dtype == DType::F32) return f(float{});
+    if (dtype == DType::F64) return f(double{});
+    if (dtype == DType::U32) return f(uint32_t{});
+    if (dtype == DType::U64) return f(uint64_t{});
+    if (dtype == DType::I32) return f(int32_t{});
+    if (dtype == DType::I64) return f(int64_t{});
+    return f(uint8_t{});  // U8, BOOL
+}
+
+std::string shown(long double x) {
+    char text[48];
+    std::snprintf(text, sizeof text, "%.17Lg", x);
+    return text;
+}
+
+// "[1, 2]" of an element.
+std::string place(const Shape& shape, size_t at) {
+    std::string text;
+    for (size_t axis = shape.size(); axis-- > 0; at /= shape[axis])
+        text = std::to_string(at % shape[axis]) + (text.empty() ? "" : ", ") + text;
+    return "[" + text + "]";
+}
+
+// A case that is being recomputed.
+struct Case {
+    const TensorFile& file;
+    std::string name;
+    Compute& compute;
+    bool verbose;
+    Precision precision = Precision::float64;  // of what is computed now
+    bool rounded = false;                      // an input was no float32
+    double worst = 0;                          // largest |got - expected| as a part of what is allowed
+    std::set<std::string> used = {};           // tensors and metadata entries that were asked for
+    std::vector<std::string> problems = {};    // what does not hold
+
+    std::string where(const StoredTensor& tensor) const {
+        return file.path + ": tensor " + json_string(tensor.name) + " at byte " +
+               std::to_string(file.data_start + tensor.begin);
+    }
+
+    const StoredTensor* find(const std::string& tensor) {
+        used.insert(name + "/" + tensor);
+        const auto found = file.index.find(name + "/" + tensor);
+        return found == file.index.end() ? nullptr : &file.tensors[found->second];
+    }
+    bool has(const std::string& tensor) const { return file.has(name + "/" + tensor); }
+    // Names of the case's tensors that begin like this, without it.
+    std::set<std::string> named(const std::string& start) const {
+        std::set<std::string> names;
+        for (const StoredTensor& tensor : file.tensors)
+            if (tensor.name.starts_with(name + "/" + start))
+                names.insert(tensor.name.substr(name.size() + 1 + start.size()));
+        return names;
+    }
+
+    const StoredTensor& need(const std::string& tensor) {
+        const StoredTensor* found = find(tensor);
+        if (!found)
+            fail("check.missing", "%s: case %s has no tensor %s; tests/vectors/README.md lists what its topic needs",
+                 file.path.c_str(), json_string(name).c_str(), json_string(name + "/" + tensor).c_str());
+        return *found;
+    }
+
+    void check_shape(const StoredTensor& tensor, const Shape& pattern) const {
+        bool fits = tensor.shape.size() == pattern.size();
+        const uint64_t most = tensor.size == 0 ? 1 << 20 : (uint64_t{1} << 31) - 1;  // nothing may stand for billions
+        for (size_t i = 0; fits && i < pattern.size(); ++i)
+            fits = tensor.shape[i] <= most && (pattern[i] == any || pattern[i] == tensor.shape[i]);
+        if (pattern.empty()) fits = tensor.size == about(tensor.dtype).size;  // a number may have any rank
+        if (fits) return;
+        std::string expected = shape_text(pattern);
+        for (size_t at; (at = expected.find(std::to_string(any))) != std::string::npos;)
+            expected.replace(at, std::to_string(any).size(), "any");
+        fail("check.shape", "%s: has shape %s, expected %s", where(tensor).c_str(), shape_text(tensor.shape).c_str(),
+             expected.c_str());
+    }
+
+    // An input as it is computed with. What float cannot hold is rounded, and the case is then not computed in double.
+    template <class T>
+    Array<T> in(const std::string& tensor_name, const Shape& pattern) {
+        const StoredTensor& tensor = need("in/" + tensor_name);
+        check_shape(tensor, pattern);
+        Array<T> array = {tensor.shape, std::vector<T>(tensor.size / about(tensor.dtype).size)};
+        with_type(tensor.dtype, [&](auto type) {
+            for (size_t i = 0; i < array.values.size(); ++i) {
+                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
+                array.values[i] = static_cast<T>(type);
+                if constexpr (std::is_same_v<T, float>)
+                    rounded |=
+                        static_cast<long double>(array.values[i]) != static_cast<long double>(type) && type == type;
+            }
+        });
+        return array;
+    }
+
+    // Whole numbers from low to high.
+    Array<int64_t> whole_in(const std::string& tensor_name, const Shape& pattern, int64_t low, int64_t high) {
+        const StoredTensor& tensor = need("in/" + tensor_name);
+        check_shape(tensor, pattern);
+        Array<int64_t> array = {tensor.shape, std::vector<int64_t>(tensor.size / about(tensor.dtype).size)};
+        with_type(tensor.dtype, [&](auto type) {
+            for (size_t i = 0; i < array.values.size(); ++i) {
+                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
+                const long double x = static_cast<long double>(type);
+                if (!(x >= static_cast<long double>(low) && x <= static_cast<long double>(high) && x == std::floor(x)))
+                    fail("check.value", "%s: entry %zu is %s, expected a whole number from %lld to %lld",
+                         where(tensor).c_str(), i, shown(x).c_str(), static_cast<long long>(low),
+                         static_cast<long long>(high));
+                array.values[i] = static_cast<int64_t>(x);
+            }
+        });
+        return array;
+    }
+
+    // An input that may be left out.
+    template <class T>
+    Array<T> in_or(const std::string& tensor_name, const Shape& pattern, T fallback) {
+        if (has("in/" + tensor_name)) return in<T>(tensor_name, pattern);
+        size_t size = 1;
+        for (const uint64_t extent : pattern) size *= extent;
+        return {pattern, std::vector<T>(size, fallback)};
+    }
+
+    // A setting: tensor CASE/in/NAME of one element, or metadata entry CASE.NAME. Without a fallback it is needed.
+    double number(const std::string& setting, std::optional<double> fallback, double low, double high) {
+        double x = 0;
+        const std::string key = name + "." + setting;
+        const auto text = file.metadata.find(key);
+        used.insert(key);
+        std::string place = file.path + ": metadata entry " + json_string(key);
+        if (has("in/" + setting)) {
+            place = where(need("in/" + setting));
+            x = in<double>(setting, {}).values[0];
+        } else if (text != file.metadata.end()) {
+            const std::optional<double> parsed = to_number(text->second);
+            if (!parsed)
+                fail("check.value", "%s is %s, expected a number", place.c_str(),
+                     json_string(text->second.substr(0, 80)).c_str());
+            x = *parsed;
+        } else if (fallback) {
+            x = *fallback;
+        } else {
+            need("in/" + setting);
+        }
+        if (!(x >= low && x <= high))
+            fail("check.value", "%s is %.17g, expected a number from %g to %g", place.c_str(), x, low, high);
+        return x;
+    }
+    int64_t whole(const std::string& setting, std::optional<double> fallback, double low, double high) {
+        const double x = number(setting, fallback, low, high);
+        if (x != std::floor(x))
+            fail("check.value", "%s: case %s: %s is %.17g, expected a whole number", file.path.c_str(), name.c_str(),
+                 setting.c_str(), x);
+        return static_cast<int64_t>(x);
+    }
+    // A word of `choices`, which are separated by |; the first is the fallback. Metadata entry CASE.NAME.
+    std::string word(const std::string& setting, const std::string& choices) {
+        const std::string key = name + "." + setting;
+        used.insert(key);
+        const auto text = file.metadata.find(key);
+        const std::vector<std::string> words = split(choices, '|');
+        if (text == file.metadata.end()) return words[0];
+        if (std::find(words.begin(), words.end(), text->second) == words.end())
+            fail("check.value", "%s: metadata entry %s is %s, expected one of %s", file.path.c_str(),
+                 json_string(key).c_str(), json_string(text->second.substr(0, 80)).c_str(), choices.c_str());
+        return text->second;
+    }
+
+    // The tolerance of an output: metadata CASE.tolerance.NAME, NAME up to any slash, or CASE.tolerance, or tolerance.
+    Tolerance tolerance(std::string output) {
+        while (true) {
+            const std::string key = name + ".tolerance" + (output.empty() ? "" : "." + output);
+            used.insert(key);
+            const auto text = file.metadata.find(key);
+            if (text != file.metadata.end())
+                return parse_tolerance(text->second, file.path + ": metadata entry " + json_string(key));
+            if (output.empty() && file.metadata.contains("tolerance"))
+                return parse_tolerance(file.text("tolerance"), file.path + ": metadata entry \"tolerance\"");
+            if (output.empty()) return {};
+            const size_t slash = output.rfind('/');
+            output.resize(slash == std::string::npos ? 0 : slash);
+        }
+    }
+
+    // Holds `got` against CASE/out/NAME. `optional`: the file may leave it out. `leading`: of `got` there may be less
+    // than the file has, and the first entries are held. `slack`: how much more than the tolerance each entry may be off.
+    template <class T>
+    void expect(const std::string& output, const Shape& shape, const std::vector<T>& got, bool optional = false,
+                bool leading = false, const std::vector<double>& slack = {}) {
+        if (optional && !find("out/" + output)) return;
+        const StoredTensor& tensor = need("out/" + output);
+        const size_t count = tensor.size / about(tensor.dtype).size;
+        if (!leading || count < got.size()) check_shape(tensor, shape);
+        const Tolerance allowed = tolerance(output);
+        std::vector<long double> expected(got.size());
+        long double scale = 0;
+        with_type(tensor.dtype, [&](auto type) {
+            for (size_t i = 0; i < expected.size(); ++i) {
+                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
+                expected[i] = static_cast<long double>(type);
+                if (std::isfinite(expected[i])) scale = std::max(scale, std::fabs(expected[i]));
+            }
+        });
+        const long double bound =
+            (precision == Precision::float64 ? allowed.float64 : allowed.float32) * scale + allowed.absolute;
+        size_t failures = 0, first = 0;
+        long double allowed_first = 0;
+        for (size_t i = 0; i < got.size(); ++i) {
+            const long double x = static_cast<long double>(got[i]), e = expected[i];
+            if (x == e || (std::isnan(x) && std::isnan(e))) continue;
+            // An expected value that is stored in float32 is itself rounded.
+            const long double here = allowed.exact ? 0
+                                                   : bound + (slack.empty() ? 0 : slack[i]) +
+                                                         (tensor.dtype == DType::F32 ? 0x1p-24L * std::fabs(e) : 0);
+            const long double off = std::fabs(x - e);
+            const double share = off <= here * 1e6L ? static_cast<double>(off / here) : INFINITY;  // NaN: infinity
+            worst = std::max(worst, share);
+            if (!(share <= 1) && failures++ == 0) first = i, allowed_first = here;
+        }
+        if (failures > 0)
+            problems.push_back("out/" + output + place(tensor.shape, first) + " in " + precision_name() + ": got " +
+                               shown(static_cast<long double>(got[first])) + ", expected " + shown(expected[first]) +
+                               (allowed.exact ? ", exactly" : " within " + shown(allowed_first)) +
+                               (failures > 1 ? "; so are " + std::to_string(failures - 1) + " more" : ""));
+        if (verbose) {
+            print("expected " + output, tensor.shape, expected);
+            print(std::string("got ") + precision_name(), tensor.shape, got);
+        }
+    }
+
+    const char* precision_name() const { return precision == Precision::float64 ? "float64" : "float32"; }
+
+    template <class T>
+    static void print(const std::string& title, const Shape& shape, const std::vector<T>& values) {
+        constexpr size_t most = 64;
+        std::printf("    %-28s %s", title.c_str(), shape_text(shape).c_str());
+        for (size_t i = 0; i < std::min(values.size(), most); ++i)
+            std::printf(" %.*Lg", std::is_same_v<T, float> ? 9 : 17, static_cast<long double>(values[i]));
+        std::printf(values.size() > most ? " ... (%zu)\n" : "\n", values.size());
+    }
+};
+
+// A computation with gradients: variables are inputs, `finish` holds the outputs against the file and, where it has
+// in/upstream (the gradient of some loss with respect to the output; in/upstream/NAME where there are several outputs),
+// the gradient of every variable against out/gradient/NAME.
+template <class T>
+struct Graph {
+    struct Variable {
+        std::string name;
+        Array<T> array;
+        std::vector<T> gradient;
+    };
+    struct Output {
+        std::string name;
+        Shape shape;
+        Tensor<T> tensor;
+    };
+    Case& c;
+    Tape<T> tape;
+    std::vector<std::unique_ptr<Variable>> variables = {};
+
+    explicit Graph(Case& a_case) : c(a_case), tape(a_case.compute) {}
+
+    Tensor<T> variable(const std::string& name, const Shape& pattern) {
+        variables.push_back(std::make_unique<Variable>(Variable{name, c.in<T>(name, pattern), {}}));
+        Variable& v = *variables.back();
+        v.gradient.resize(v.array.values.size());
+        if (v.array.back() < 1 || v.array.values.size() >= 1u << 31)
+            fail("check.shape", "%s: has shape %s, expected at least one column and less than 2^31 numbers",
+                 c.where(c.need("in/" + name)).c_str(), shape_text(v.array.shape).c_str());
+        const bool row = v.array.shape.size() == 1;
+        return {v.array.values.data(), v.gradient.data(), row ? 1 : v.array.extent(0), v.array.back()};
+    }
+
+    void finish(const std::vector<Output>& outputs) {
+        std::vector<Array<T>> upstream;
+        for (const Output& output : outputs) {
+            c.expect(output.name, output.shape,
+                     std::vector<T>(output.tensor.value, output.tensor.value + output.tensor.size()));
+            const std::string name = outputs.size() == 1 ? "upstream" : "upstream/" + output.name;
+            if (c.has("in/" + name))
+                upstream.push_back(c.in<T>(name, output.shape));
+            else
+                upstream.push_back({});
+        }
+        if (c.named("in/upstream").empty()) return;
+        const Tensor<T> loss = tape.make(1, 1);
+        for (size_t i = 0; i < outputs.size(); ++i) {
+            const T* from = upstream[i].values.data();
+            const size_t count = upstream[i].values.size();
+            T* to = outputs[i].tensor.gradient;
+            tape.on_backward([=] {
+                for (size_t k = 0; k < count; ++k) to[k] += from[k];
+            });
+        }
+        tape.backward(loss);
+        for (const auto& v : variables) c.expect("gradient/" + v->name, v->array.shape, v->gradient);
+    }
+};
+
+Shape shape_of(int rows, int columns) { return {static_cast<uint64_t>(rows), static_cast<uint64_t>(columns)}; }
+Shape shape_of(int n) { return {static_cast<uint64_t>(n)}; }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: random numbers and returns
+
+void check_rng(Case& c) {
+    if (c.has("in/counter")) {  // the generator itself
+        const auto counter = c.whole_in("counter", {any, 4}, 0, 0xFFFFFFFF);
+        const auto key = c.whole_in("key", {counter.shape[0], 2}, 0, 0xFFFFFFFF);
+        std::vector<uint32_t> words;
+        for (size_t i = 0; i < counter.shape[0]; ++i) {
+            const auto word = [&](size_t j) { return static_cast<uint32_t>(counter.values[4 * i + j]); };
+            const Words4 w = philox({word(0), word(1), word(2), word(3)}, static_cast<uint32_t>(key.values[2 * i]),
+                                    static_cast<uint32_t>(key.values[2 * i + 1]));
+            words.insert(words.end(), w.begin(), w.end());
+        }
+        return c.expect("words", {counter.shape[0], 4}, words);
+    }
+    // What is drawn from it by (seed, stream, step, site, index).
+    const Random random{static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF)),
+                        static_cast<Stream>(c.whole("stream", {}, 0, 0xFFFFFFFF))};
+    const auto index = c.whole_in("index", {any}, 0, 0xFFFFFFFF);
+    const auto numbers = [&](const char* name, int64_t fallback, int64_t low, int64_t high) {
+        if (c.has(std::string("in/") + name)) return c.whole_in(name, index.shape, low, high).values;
+        return std::vector<int64_t>(index.values.size(), fallback);
+    };
+    constexpr int64_t most = std::numeric_limits<int64_t>::max();
+    const std::vector<int64_t> step = numbers("step", 0, 0, most), site = numbers("site", 0, 0, 0xFFFFFFFF),
+                               bound = numbers("bound", 1, 1, most);
+    std::vector<double> uniform;
+    std::vector<uint64_t> below;
+    std::vector<float> normal;
+    for (size_t i = 0; i < index.values.size(); ++i) {
+        const uint64_t at = static_cast<uint64_t>(step[i]);
+        const uint32_t which = static_cast<uint32_t>(index.values[i]), where = static_cast<uint32_t>(site[i]);
+        uniform.push_back(random.uniform(at, which, where));
+        below.push_back(random.below(static_cast<uint64_t>(bound[i]), at, which, where));
+        normal.push_back(random.normal(at, which, where));
+    }
+    c.expect("uniform", index.shape, uniform, true);
+    c.expect("below", index.shape, below, true);
+    c.expect("normal", index.shape, normal, true);
+}
+
+// Trajectories laid end to end: rewards [n], lengths [trajectories].
+void check_returns(Case& c) {
+    const auto rewards = c.in<float>("rewards", {any});
+    const double gamma = c.number("gamma", 0.99, 0, 1), scale = c.number("reward_scale", 1, 1e-9, 1e9);
+    std::vector<double> g, d;
+    std::vector<float> scaled;
+    size_t at = 0;
+    const auto lengths = c.has("in/lengths") ? c.whole_in("lengths", {any}, 1, 1 << 30).values
+                                             : std::vector<int64_t>{static_cast<int64_t>(rewards.values.size())};
+    for (const int64_t length : lengths) {
+        if (static_cast<size_t>(length) > rewards.values.size() - at)
+            fail("check.value", "%s: case %s: in/lengths add up to more than the %zu rewards", c.file.path.c_str(),
+                 c.name.c_str(), rewards.values.size());
+        Trajectory trajectory;
+        trajectory.rewards.assign(rewards.values.begin() + static_cast<ptrdiff_t>(at),
+                                  rewards.values.begin() + static_cast<ptrdiff_t>(at + static_cast<size_t>(length)));
+        trajectory.states = trajectory.actions = trajectory.rewards;
+        relabel(trajectory, 1, 1, gamma);
+        g.insert(g.end(), trajectory.returns_to_go.begin(), trajectory.returns_to_go.end());
+        d.insert(d.end(), trajectory.discounted_returns.begin(), trajectory.discounted_returns.end());
+        at += static_cast<size_t>(length);
+    }
+    for (const double x : g) scaled.push_back(static_cast<float>(x * scale));  // what the network is told
+    c.expect("g", rewards.shape, g);
+    c.expect("d", rewards.shape, d);
+    c.precision = Precision::float32;
+    c.expect("scaled_g", rewards.shape, scaled, true);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: the layers
+
+template <class T>
+void check_linear(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> x = graph.variable("x", {any, any});
+    const uint64_t in = static_cast<uint64_t>(x.columns);
+    const bool conv1d = c.word("layout", "out_in|in_out") == "in_out";
+    const Tensor<T> weight = graph.variable("weight", conv1d ? Shape{in, any} : Shape{any, in});
+    const int out = conv1d ? weight.columns : weight.rows;
+    const Tensor<T> bias = graph.variable("bias", shape_of(out));
+    const Affine<T> affine = {weight, bias, conv1d ? Layout::in_out : Layout::out_in};
+    graph.finish({{"y", shape_of(x.rows, out), linear(graph.tape, x, affine)}});
+}
+
+template <class T>
+void check_layernorm(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> x = graph.variable("x", {any, any});
+    const Tensor<T> weight = graph.variable("weight", shape_of(x.columns));
+    const Tensor<T> bias = graph.variable("bias", shape_of(x.columns));
+    graph.finish({{"y", shape_of(x.rows, x.columns), layer_norm(graph.tape, x, Norm<T>{weight, bias})}});
+}
+
+// Both layers are GPT-2's Conv1D: weights [in, out].
+template <class T>
+void check_mlp(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> x = graph.variable("x", {any, any});
+    const Tensor<T> w1 = graph.variable("c_fc.weight", {static_cast<uint64_t>(x.columns), any});
+    const Tensor<T> b1 = graph.variable("c_fc.bias", shape_of(w1.columns));
+    const Tensor<T> w2 = graph.variable("c_proj.weight", {static_cast<uint64_t>(w1.columns), any});
+    const Tensor<T> b2 = graph.variable("c_proj.bias", shape_of(w2.columns));
+    const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Relu{});
+    const Tensor<T> y = linear(graph.tape, hidden, Affine<T>{w2, b2, Layout::in_out});
+    graph.finish({{"y", shape_of(x.rows, w2.columns), y}});
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: attention and tokens
+
+// Packed sequences: lengths [windows], whole numbers that add up to n; left out: one sequence.
+std::vector<int> lengths_of(Case& c, int n) {
+    if (!c.has("in/lengths")) return n > 0 ? std::vector<int>{n} : std::vector<int>{};
+    const auto lengths = c.whole_in("lengths", {any}, 1, std::max(n, 1));
+    int64_t total = 0;
+    for (const int64_t length : lengths.values) total += length;
+    if (total != n)
+        fail("check.value", "%s: case %s: in/lengths add up to %lld, but there are %d rows", c.file.path.c_str(),
+             c.name.c_str(), static_cast<long long>(total), n);
+    return {lengths.values.begin(), lengths.values.end()};
+}
+
+template <class T>
+void check_attention(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> q = graph.variable("q", {any, any}), k = graph.variable("k", shape_of(q.rows, q.columns)),
+                    v = graph.variable("v", shape_of(q.rows, q.columns));
+    const int heads = static_cast<int>(c.whole("heads", 1, 1, 1 << 20)), n = q.rows, d = q.columns;
+    const std::vector<int> lengths = lengths_of(c, n);
+    if (d % heads != 0 || n > 100000 || std::any_of(lengths.begin(), lengths.end(), [](int l) { return l > 4096; }))
+        fail("check.value",
+             "%s: case %s: %d columns, %d heads, %d rows: heads must divide columns, and there may be "
+             "100000 rows at most, 4096 in a sequence",
+             c.file.path.c_str(), c.name.c_str(), d, heads, n);
+    // Keys and values as c_attn lays them: side by side.
+    const Tensor<T> kv = graph.tape.make(n, 2 * d);
+    const auto each = [=](auto&& f) {
+        for (ptrdiff_t i = 0; i < n; ++i)
+            for (ptrdiff_t j = 0; j < d; ++j) f(2 * i * d + j, i * d + j);
+    };
+    each([&](ptrdiff_t to, ptrdiff_t from) { kv.value[to] = k.value[from], kv.value[to + d] = v.value[from]; });
+    graph.tape.on_backward([=] {
+        each([=](ptrdiff_t from, ptrdiff_t to) {
+            k.gradient[to] += kv.gradient[from], v.gradient[to] += kv.gradient[from + d];
+        });
+    });
+    std::vector<Span> spans;
+    std::vector<int> position(static_cast<size_t>(n));
+    std::iota(position.begin(), position.end(), 0);
+    for (const int length : lengths) {
+        const int first = spans.empty() ? 0 : spans.back().first_token + spans.back().tokens;
+        spans.push_back({first, length, first, length});
+    }
+    const Tensor<T> y = attention(graph.tape, q, kv, spans.data(), static_cast<int>(spans.size()), position.data(),
+                                  heads, dropout_at(graph.tape, 0, 0));
+    graph.finish({{"y", shape_of(n, d), y}});
+}
+
+// Names in ODT's dictionary that carry nothing the action prediction uses.
+bool is_unused_parameter(const std::string& name) {
+    const auto starts = [&](const char* text) { return name.starts_with(text); };
+    return starts("predict_state.") || starts("predict_return.") || starts("embed_timestep.") ||
+           starts("transformer.wte.") || starts("transformer.wpe.") || name.ends_with(".attn.bias") ||
+           name.ends_with(".attn.masked_bias");
+}
+
+// The network whose weights are in/parameter/NAME, under ODT's names; its sizes are theirs. Setting: heads.
+template <class T>
+std::unique_ptr<Transformer<T>> read_model(Case& c) {
+    const std::set<std::string> names = c.named("in/parameter/");
+    const auto shape = [&](const std::string& name) {
+        const StoredTensor& tensor = c.need("in/parameter/" + name);
+        c.check_shape(tensor, {any, any});
+        return tensor.shape;
+    };
+    TransformerConfig config{};
+    config.state_dim = static_cast<int>(shape("embed_state.weight")[1]);
+    config.action_dim = static_cast<int>(shape("embed_action.weight")[1]);
+    config.width = static_cast<int>(shape("embed_state.weight")[0]);
+    const uint64_t d = static_cast<uint64_t>(config.width);
+    const auto fused = [&] { return "transformer.h." + std::to_string(config.layers) + ".attn.c_attn.weight"; };
+    for (; names.contains(fused()); ++config.layers)  // before anything so large is allocated
+        c.check_shape(c.need("in/parameter/" + fused()), {d, 3 * d});
+    config.heads =
+        static_cast<int>(c.whole("heads", config.layers > 0 ? std::nullopt : std::optional(1.0), 1, 1 << 20));
+    if (names.contains("embed_ordering.weight"))
+        config.max_timesteps = static_cast<int>(shape("embed_ordering.weight")[0]);
+    config.head = names.contains("predict_action.logits.weight") ? Head::categorical
+                  : names.contains("predict_action.0.weight")    ? Head::deterministic
+                                                                 : Head::squashed_gaussian;
+    auto model = std::make_unique<Transformer<T>>(config, 0);
+    for (Parameter<T>& parameter : model->parameters) {
+        const Array<T> array = c.in<T>("parameter/" + parameter.name, parameter.shape);
+        std::copy(array.values.begin(), array.values.end(), parameter.value.begin());
+    }
+    for (const std::string& name : names)
+        if (is_unused_parameter(name)) c.find("in/parameter/" + name);
+    return model;
+}
+
+// Windows: states [n, S], actions [n, A], returns_to_go [n], timesteps [n] and lengths [windows], packed; or [windows,
+// C, S], [windows, C, A], [windows, C], [windows, C] when all have C steps. Discrete actions are tokens one-hot, and
+// given as whole numbers [n]. timesteps left out: 0, 1, ... in each window.
+struct Windows {
+    SequenceBatch sequences;
+    std::vector<float> actions;  // [n, A] or [n]
+    Shape steps;                 // [n], or [windows, C]
+    int action_width = 1;        // of `actions`
+
+    Shape rows_of(uint64_t width) const {
+        Shape shape = steps;
+        shape.push_back(width);
+        return shape;
+    }
+};
+
+std::vector<float> actions_in(Case& c, const std::string& name, const Windows& windows,
+                              const TransformerConfig& config) {
+    if (config.head != Head::categorical)
+        return c.in<float>(name, windows.rows_of(static_cast<uint64_t>(config.action_dim))).values;
+    const auto moves = c.whole_in(name, windows.steps, 0, config.action_dim - 1);
+    return {moves.values.begin(), moves.values.end()};
+}
+
+Windows read_windows(Case& c, const TransformerConfig& config) {
+    Windows windows;
+    const size_t rank = c.need("in/states").shape.size();
+    Shape pattern(rank == 3 ? 3 : 2, any);
+    pattern.back() = static_cast<uint64_t>(config.state_dim);
+    const Array<float> states = c.in<float>("states", pattern);
+    windows.steps.assign(states.shape.begin(), states.shape.end() - 1);
+    SequenceBatch& batch = windows.sequences;
+    batch.states = states.values;
+    const int n = static_cast<int>(states.values.size() / static_cast<size_t>(config.state_dim));
+    if (rank == 3)
+        batch.lengths.assign(windows.steps[0], states.extent(1));
+    else
+        batch.lengths = lengths_of(c, n);
+    const int longest = batch.lengths.empty() ? 0 : *std::max_element(batch.lengths.begin(), batch.lengths.end());
+    if (n < 1 || n > 1000000 || longest > 1000)
+        fail("check.value",
+             "%s: case %s: %d steps, %d in the longest window; there must be 1 to a million, and at most 1000",
+             c.file.path.c_str(), c.name.c_str(), n, longest);
+    batch.returns_to_go = c.in<float>("returns_to_go", windows.steps).values;
+    if (c.has("in/timesteps")) {
+        const auto timesteps = c.whole_in("timesteps", windows.steps, 0, 1 << 30);
+        batch.timesteps.assign(timesteps.values.begin(), timesteps.values.end());
+    } else {
+        for (const int length : batch.lengths)
+            for (int t = 0; t < length; ++t) batch.timesteps.push_back(t);
+    }
+    windows.actions = actions_in(c, "actions", windows, config);
+    if (config.head == Head::categorical) {
+        for (const float move : windows.actions)
+            for (int i = 0; i < config.action_dim; ++i)
+                batch.actions.push_back(move == static_cast<float>(i) ? 1.f : 0.f);
+    } else {
+        windows.action_width = config.action_dim;
+        batch.actions = windows.actions;
+    }
+    return windows;
+}
+
+// The output of every layer of one pass, by name, and with gradients(), after backward, the loss's gradient at it.
+template <class T>
+struct LayerOutputs {
+    struct Output {
+        std::string name;
+        Shape shape;
+        std::vector<T> value;  // copied: backward() uses the memory for other things
+        const T* gradient;
+    };
+    std::vector<Output> outputs;
+
+    // Of the next forward() on this tape.
+    void watch(Tape<T>& tape) {
+        outputs.clear();
+        tape.watch = [this](const std::string& name, const Tensor<T>& x) {
+            outputs.push_back({name, shape_of(x.rows, x.columns), {x.value, x.value + x.size()}, x.gradient});
+        };
+    }
+};
+
+// Tokens as they enter the stack, R s a of each step but for the last action of a window, before embed_ln; and, where
+// the file has them, the outputs of all layers.
+template <class T>
+void check_tokens(Case& c) {
+    const auto model = read_model<T>(c);
+    const Windows windows = read_windows(c, model->config);
+    Tape<T> tape(c.compute);
+    LayerOutputs<T> layers;
+    layers.watch(tape);
+    forward(tape, *model, windows.sequences, Ask::every_state);
+    bool held = false;
+    for (const auto& output : layers.outputs) {
+        held |= c.has("out/layer/" + output.name);
+        c.expect("layer/" + output.name, output.shape, output.value, true);
+    }
+    if (!held) c.need("out/layer/embed");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: policy heads
+
+// mean [n, A]; log_std [n, A], or log_std_raw [n, A] before it is squashed. actions [n, A] -> log_prob [n]; noise
+// [n, A] -> entropy [n], action [n, A]; data_actions [n, A] -> clamped.
+template <class T>
+void check_policy_gaussian(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> mean = graph.variable("mean", {any, any});
+    const Shape shape = shape_of(mean.rows, mean.columns), rows = shape_of(mean.rows);
+    const bool raw = c.has("in/log_std_raw");
+    Policy<T> policy = {mean, graph.variable(raw ? "log_std_raw" : "log_std", shape)};
+    std::vector<typename Graph<T>::Output> outputs;
+    if (raw) {
+        policy.log_std = squash_log_std(graph.tape, policy.log_std);
+        outputs.push_back({"log_std", shape, policy.log_std});
+    }
+    std::vector<float> actions, noise;
+    if (c.has("in/actions")) {
+        actions = c.in<float>("actions", shape).values;
+        outputs.push_back({"log_prob", rows, gaussian_log_prob(graph.tape, policy, actions.data())});
+    }
+    if (c.has("in/noise")) {
+        noise = c.in<float>("noise", shape).values;
+        outputs.push_back({"entropy", rows, gaussian_entropy(graph.tape, policy, noise.data())});
+    }
+    if constexpr (std::is_same_v<T, float>) {
+        std::vector<float> sampled, likely, clamped;
+        for (size_t i = 0; i < mean.size(); ++i) {
+            likely.push_back(squashed_action(policy.mean.value[i]));
+            if (!noise.empty())
+                sampled.push_back(squashed_action(policy.mean.value[i] + std::exp(policy.log_std.value[i]) * noise[i]));
+        }
+        c.expect("most_likely", shape, likely, true);
+        if (!noise.empty()) c.expect("sampled", shape, sampled, true);
+        if (c.has("in/data_actions"))
+            for (const float a : c.in<float>("data_actions", shape).values) clamped.push_back(clamp_action(a));
+        if (c.has("in/data_actions")) c.expect("clamped", shape, clamped);
+    }
+    if (outputs.empty() && c.has("in/data_actions")) return;
+    graph.finish(outputs);
+}
+
+// logits [n, moves] -> log_probabilities, entropy [n], most_likely [n]; actions [n] -> log_prob [n]; uniform [n] ->
+// sampled [n].
+template <class T>
+void check_policy_discrete(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> logits = graph.variable("logits", {any, any});
+    const Shape rows = shape_of(logits.rows);
+    const Tensor<T> log_p = log_softmax(graph.tape, logits);
+    std::vector<typename Graph<T>::Output> outputs = {
+        {"log_probabilities", shape_of(logits.rows, logits.columns), log_p},
+        {"entropy", rows, categorical_entropy(graph.tape, log_p)}};
+    std::vector<float> actions;
+    if (c.has("in/actions")) {
+        const auto moves = c.whole_in("actions", rows, 0, logits.columns - 1);
+        actions.assign(moves.values.begin(), moves.values.end());
+        outputs.push_back({"log_prob", rows, categorical_log_prob(graph.tape, log_p, actions.data())});
+    }
+    if constexpr (std::is_same_v<T, float>) {
+        std::vector<int> likely, sampled;
+        const auto uniform = c.in_or<double>("uniform", rows, 0);
+        for (int row = 0; row < logits.rows; ++row) {
+            const float* p = log_p.value + static_cast<ptrdiff_t>(row) * logits.columns;
+            likely.push_back(most_likely_move(p, logits.columns));
+            sampled.push_back(sampled_move(p, logits.columns, uniform.values[static_cast<size_t>(row)]));
+        }
+        c.expect("most_likely", rows, likely, true);
+        if (c.has("in/uniform")) c.expect("sampled", rows, sampled);
+    }
+    graph.finish(outputs);
+}
+
+// DT's head: raw [n, A] -> action [n, A]; actions [n, A] -> log_prob [n], minus the mean squared error.
+template <class T>
+void check_policy_deterministic(Case& c) {
+    Graph<T> graph(c);
+    const Tensor<T> raw = graph.variable("raw", {any, any});
+    const Shape shape = shape_of(raw.rows, raw.columns);
+    const Policy<T> policy = {tanh_of(graph.tape, raw), {}};
+    const auto actions = c.in<float>("actions", shape);
+    graph.finish(
+        {{"action", shape, policy.mean},
+         {"log_prob", shape_of(raw.rows), log_prob(graph.tape, Head::deterministic, policy, actions.values.data())}});
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: the memory
+
+// The table after (states [n, S], actions [n, A], e [n]) in this order, by eq. (4). Settings: capacity, K, epsilon, tau,
+// eviction, exclude_self; projection [F1, S].
+struct Table {
+    Array<float> states, actions;
+    Array<double> e;
+    EpisodicMemory memory;
+};
+
+MemoryConfig memory_settings(Case& c, int state_dim, int action_dim, int projected_dim, size_t n) {
+    MemoryConfig config{};
+    config.state_dim = state_dim;
+    config.action_dim = action_dim;
+    config.projected_dim = projected_dim;
+    // More room than rows changes nothing.
+    config.capacity = std::min(n + 1, static_cast<size_t>(c.whole("capacity", static_cast<double>(n + 1), 1, 1e12)));
+    config.K = static_cast<int>(c.whole("K", 1, 1, 100000));
+    config.epsilon = c.number("epsilon", INFINITY, 0, INFINITY);
+    config.tau = c.number("tau", 1, 1e-9, 1e9);
+    config.exclude_self = c.whole("exclude_self", 0, 0, 1) == 1;
+    config.eviction = c.word("eviction", "lfu|lru") == "lfu" ? Eviction::lfu : Eviction::lru;
+    return config;
+}
+
+Table empty_table(Case& c) {
+    const Array<float> states = c.in<float>("states", {any, any});
+    const uint64_t n = states.shape[0];
+    const Array<float> actions =
+        c.has("in/actions") ? c.in<float>("actions", {n, any}) : Array<float>{{n, 1}, std::vector<float>(n)};
+    const Array<double> e = c.in_or<double>("e", {n}, 0);
+    const bool projects = c.has("in/projection");
+    const Array<double> projection =
+        projects ? c.in<double>("projection", {any, states.shape[1]}) : Array<double>{{0, 0}, {}};
+    check_finite("projection", projection.values.data(), projection.values.size());
+    EpisodicMemory memory(memory_settings(c, states.extent(1), actions.extent(1), projection.extent(0), n), 0);
+    memory.projection = projection.values;
+    return {states, actions, e, std::move(memory)};
+}
+
+void take_in(Table& table, size_t row, EpisodicMemory::Changes& changes) {
+    const size_t S = table.memory.S, A = table.memory.A;
+    check_finite("states", &table.states.values[row * S], S);
+    check_finite("actions", &table.actions.values[row * A], A);
+    check_finite("e", &table.e.values[row], 1);
+    table.memory.update_one(changes, &table.states.values[row * S], &table.actions.values[row * A],
+                            table.e.values[row]);
+}
+
+Table full_table(Case& c) {
+    Table table = empty_table(c);
+    EpisodicMemory::Changes changes;
+    for (size_t row = 0; row < table.states.shape[0]; ++row) take_in(table, row, changes);
+    return table;
+}
+
+uint32_t entry_of(const Table& table, size_t row) {
+    const EpisodicMemory& m = table.memory;
+    return m.slots[m.find_slot(state_key(&table.states.values[row * m.S], m.S))];
+}
+
+// What becomes of the rows. looks_up [n]: rows that are look-ups instead, of the row's state; their neighbours count as
+// accessed. -> stored [n]: whether the state is in the table at the end; e, actions, accesses [n]: of its entry.
+void check_memory_update(Case& c) {
+    Table table = empty_table(c);
+    const Shape rows = {table.states.shape[0]};
+    const auto looks_up = c.in_or<double>("looks_up", rows, 0);
+    EpisodicMemory::Changes changes;
+    for (size_t row = 0; row < rows[0]; ++row) {
+        if (looks_up.values[row] == 0) {
+            take_in(table, row, changes);
+        } else {
+            const Neighbourhoods found = table.memory.search(&table.states.values[row * table.memory.S], 1);
+            table.memory.count_accesses(found[0]);
+        }
+    }
+    std::vector<int> stored;
+    std::vector<double> e;
+    std::vector<float> actions;
+    std::vector<uint64_t> accesses;
+    for (size_t row = 0; row < rows[0]; ++row) {
+        const uint32_t entry = entry_of(table, row);
+        const bool there = entry != no_entry;
+        stored.push_back(there);
+        e.push_back(there ? table.memory.e[entry] : NAN);
+        accesses.push_back(there ? table.memory.priority[entry] : 0);
+        for (size_t i = 0; i < table.memory.A; ++i)
+            actions.push_back(there ? table.memory.actions[entry * table.memory.A + i] : NAN);
+    }
+    c.expect("stored", rows, stored);
+    c.expect("e", rows, e);
+    c.expect("actions", table.actions.shape, actions, true);
+    c.expect("accesses", rows, accesses, true);
+    c.expect("size", {}, std::vector<uint64_t>{table.memory.size()}, true);
+    c.expect("changes", {4}, std::vector<uint64_t>{changes.inserted, changes.improved, changes.kept, changes.evicted},
+             true);
+}
+
+// query [m, S]: K(s_q) of each.
+Neighbourhoods look_up(Case& c, const Table& table, uint64_t& m) {
+    const auto query = c.in<float>("query", {any, table.states.shape[1]});
+    m = query.shape[0];
+    if (m * static_cast<uint64_t>(table.memory.config.K) > 100000000)
+        fail("check.value", "%s: case %s: %llu queries of %d neighbours are more than 10^8", c.file.path.c_str(),
+             c.name.c_str(), static_cast<unsigned long long>(m), table.memory.config.K);
+    return table.memory.search(query.values.data(), m);
+}
+
+// -> neighbours [m, K]: rows of states, closest first, then -1; distances [m, K], then infinity; count [m]; e_hat [m]:
+// NaN where K(s_q) is empty.
+void check_memory_lookup(Case& c) {
+    const Table table = full_table(c);
+    uint64_t m = 0;
+    const Neighbourhoods found = look_up(c, table, m);
+    std::map<uint32_t, int> row_of;
+    for (size_t row = table.states.shape[0]; row-- > 0;) row_of[entry_of(table, row)] = static_cast<int>(row);
+    std::vector<int> neighbours, count;
+    std::vector<float> distances;
+    std::vector<double> e_hat;
+    for (size_t i = 0; i < m; ++i) {
+        for (size_t k = 0; k < found.K; ++k) {
+            const bool there = k < found[i].size();
+            neighbours.push_back(there ? row_of.at(found[i][k].entry) : -1);
+            distances.push_back(there ? found[i][k].distance : INFINITY);
+        }
+        count.push_back(static_cast<int>(found[i].size()));
+        e_hat.push_back(table.memory.approximate_return(found[i]));
+    }
+    c.expect("neighbours", {m, found.K}, neighbours, c.has("out/e_hat"));
+    c.expect("count", {m}, count, true);
+    c.expect("distances", {m, found.K}, distances, true);
+    c.expect("e_hat", {m}, e_hat, true);
+}
+
+// uniform [m] -> action [m, A]: a-hat(s_q).
+void check_memory_action(Case& c) {
+    const Table table = full_table(c);
+    uint64_t m = 0;
+    const Neighbourhoods found = look_up(c, table, m);
+    const auto uniform = c.in<double>("uniform", {m});
+    std::vector<float> actions;
+    for (size_t i = 0; i < m; ++i) {
+        if (!(uniform.values[i] >= 0 && uniform.values[i] < 1))
+            fail("check.value", "%s: in/uniform[%zu] is %.17g, expected a number from 0, below 1", c.file.path.c_str(),
+                 i, uniform.values[i]);
+        const float* action = table.memory.remembered_action(found[i], uniform.values[i]);
+        actions.insert(actions.end(), action, action + table.memory.A);
+    }
+    c.expect("action", {m, table.memory.A}, actions);
+}
+
+// d [m], alpha -> w [m].
+void check_weights(Case& c) {
+    const Table table = full_table(c);
+    uint64_t m = 0;
+    const Neighbourhoods found = look_up(c, table, m);
+    const auto d = c.in<double>("d", {m});
+    const double alpha = c.number("alpha", {}, 0, 1);
+    std::vector<double> w, e_hat;
+    for (size_t i = 0; i < m; ++i) {
+        w.push_back(table.memory.weight(found[i], d.values[i], alpha));
+        e_hat.push_back(table.memory.approximate_return(found[i]));
+    }
+    c.expect("w", {m}, w);
+    c.expect("e_hat", {m}, e_hat, true);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: objective and optimiser
+
+// What a batch's steps are worth: weights [n] (1), remembered_actions (the actions); the mean over windows and steps.
+Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& config) {
+    Batch batch;
+    batch.sequences = windows.sequences;
+    batch.actions = windows.actions;
+    batch.remembered =
+        c.has("in/remembered_actions") ? actions_in(c, "remembered_actions", windows, config) : windows.actions;
+    batch.weights = c.in_or<float>("weights", windows.steps, 1).values;
+    const std::vector<int>& lengths = windows.sequences.lengths;
+    for (const int length : lengths)
+        batch.mean.insert(batch.mean.end(), static_cast<size_t>(length),
+                          1.0 / (static_cast<double>(lengths.size()) * length));
+    return batch;
+}
+
+// mean [n, A] (logits [n, moves] for the categorical head, raw for DT's), log_std [n, A], actions, ..., noise [n, A],
+// log_temperature, eta -> L, H, loss, gradients; lambda_gradient: of the temperature's loss, by log lambda.
+template <class T>
+void check_objective(Case& c) {
+    Graph<T> graph(c);
+    TransformerConfig config{};
+    config.head = c.has("in/logits") ? Head::categorical
+                  : c.has("in/raw")  ? Head::deterministic
+                                     : Head::squashed_gaussian;
+    const char* name = config.head == Head::categorical     ? "logits"
+                       : config.head == Head::deterministic ? "raw"
+                                                            : "mean";
+    Policy<T> policy = {graph.variable(name, {any, any}), {}};
+    config.action_dim = policy.mean.columns;
+    const bool gaussian = config.head == Head::squashed_gaussian;
+    if (gaussian) policy.log_std = graph.variable("log_std", shape_of(policy.mean.rows, config.action_dim));
+    if (config.head == Head::categorical) policy.mean = log_softmax(graph.tape, policy.mean);
+    if (config.head == Head::deterministic) policy.mean = tanh_of(graph.tape, policy.mean);
+    Windows windows;
+    windows.steps = shape_of(policy.mean.rows);
+    windows.sequences.lengths = lengths_of(c, policy.mean.rows);
+    windows.actions = actions_in(c, "actions", windows, config);
+    const Batch batch = read_batch(c, windows, config);
+    const bool constrain = config.head != Head::deterministic;
+    std::vector<float> noise;
+    if (gaussian) noise = c.in<float>("noise", windows.rows_of(static_cast<uint64_t>(config.action_dim))).values;
+    const double log_lambda = constrain ? c.number("log_temperature", std::log(0.1), -50, 50) : 0;
+    const T lambda = static_cast<T>(std::exp(static_cast<T>(log_lambda)));
+    const Objective<T> result = objective(graph.tape, config.head, policy, batch, noise.data(), lambda, constrain);
+    const auto scalar = [&](const char* output, T value, bool optional) {
+        c.expect(output, {}, std::vector<T>{value}, optional);
+    };
+    scalar("L", result.L.value[0], false);
+    scalar("loss", result.lagrangian.value[0], true);
+    if (constrain) scalar("H", result.H.value[0], false);
+    graph.tape.backward(result.lagrangian);
+    for (const auto& v : graph.variables)
+        c.expect("gradient/" + v->name, v->array.shape, v->gradient, c.named("out/gradient/").empty());
+    if (!constrain || !std::is_same_v<T, float> || !c.has("out/log_temperature")) return;
+    Settings settings;  // one step of lambda
+    settings.eta = c.number("eta", {}, -1e9, 1e9);
+    settings.lambda_learning_rate = c.number("lambda_learning_rate", 1e-4, 0, 1);
+    Temperature temperature(1);
+    temperature.log_lambda[0].value[0] = static_cast<float>(log_lambda);
+    update_lambda(c.compute, temperature, settings, result.H.value[0]);
+    c.expect("log_temperature", {}, temperature.log_lambda[0].value);
+}
+
+// parameter/NAME [...], gradient/NAME [steps, ...] -> after/NAME [steps, ...]: the parameter after each step; norm
+// [steps]: of all gradients before clipping. Settings: those of OptimizerConfig.
+void check_optimizer(Case& c) {
+    OptimizerConfig config;
+    const std::string rule = c.word("optimizer", "lamb|adamw");
+    config.rule = rule == "lamb" ? OptimizerConfig::Rule::lamb : OptimizerConfig::Rule::adamw;
+    config.learning_rate = c.number("learning_rate", {}, 0, 1e9);
+    config.beta1 = c.number("beta1", config.beta1, 0, 1);
+    config.beta2 = c.number("beta2", config.beta2, 0, 1);
+    config.epsilon = c.number("optimizer_epsilon", config.epsilon, 0, 1);
+    config.weight_decay = c.number("weight_decay", 0, 0, 1e9);
+    config.always_adapt = c.whole("always_adapt", 0, 0, 1) == 1;
+    config.clip_norm = c.number("clip_norm", config.clip_norm, 0, 1e9);
+    config.warmup_updates = static_cast<uint64_t>(c.whole("warmup_updates", 0, 0, 1e9));
+    Optimizer optimizer;
+    optimizer.updates = static_cast<uint64_t>(c.whole("updates_before", 0, 0, 1e9));
+    std::vector<Parameter<float>> parameters;
+    std::vector<Array<float>> gradients;
+    std::vector<std::vector<float>> after;
+    uint64_t steps = any;
+    for (const std::string& name : c.named("in/parameter/")) {
+        Shape shape = c.need("in/parameter/" + name).shape;
+        const Array<float> value = c.in<float>("parameter/" + name, shape);
+        if (value.values.empty())
+            fail("check.shape", "%s: has no entry", c.where(c.need("in/parameter/" + name)).c_str());
+        parameters.push_back({name, shape, value.values, std::vector<float>(value.values.size())});
+        shape.insert(shape.begin(), steps);
+        gradients.push_back(c.in<float>("gradient/" + name, shape));
+        steps = gradients.back().shape[0];
+    }
+    if (parameters.empty()) c.need("in/parameter/NAME");
+    after.resize(parameters.size());
+    std::vector<double> norms;
+    for (size_t step = 0; step < steps; ++step) {
+        for (size_t p = 0; p < parameters.size(); ++p)
+            std::copy_n(gradients[p].values.begin() + static_cast<ptrdiff_t>(step * parameters[p].value.size()),
+                        parameters[p].value.size(), parameters[p].gradient.begin());
+        norms.push_back(update_parameters(c.compute, parameters, optimizer, config));
+        for (size_t p = 0; p < parameters.size(); ++p)
+            after[p].insert(after[p].end(), parameters[p].value.begin(), parameters[p].value.end());
+    }
+    for (size_t p = 0; p < parameters.size(); ++p)
+        c.expect("after/" + parameters[p].name, gradients[p].shape, after[p]);
+    c.expect("norm", {steps}, norms, true);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: the replay buffer, scores and the grid world
+
+// lengths [trajectories], rewards [n]. The first `initial` (all) trajectories are the data set, the others come one by
+// one. draws [m]: a step of the buffer, all trajectories laid end to end. -> order: which trajectory each place of the
+// buffer holds; trajectory (a place), start, length [m].
+void check_sampling(Case& c) {
+    const auto rewards = c.in<float>("rewards", {any});
+    const std::vector<int> lengths = lengths_of(c, rewards.extent(0));
+    const size_t count = lengths.size();
+    const size_t initial =
+        static_cast<size_t>(c.whole("initial", static_cast<double>(count), 0, static_cast<double>(count)));
+    const int context_length = static_cast<int>(c.whole("context_length", 20, 1, 1 << 30));
+    ReplayBuffer buffer{
+        1,  1, 1.0, static_cast<size_t>(c.whole("capacity", static_cast<double>(std::max<size_t>(count, 1)), 1, 1e9)),
+        {}, 0, {}};
+    std::vector<Trajectory> trajectories;
+    size_t at = 0;
+    for (size_t i = 0; i < count; ++i) {
+        Trajectory trajectory;
+        const auto first = rewards.values.begin() + static_cast<ptrdiff_t>(at);
+        trajectory.rewards.assign(first, first + lengths[i]);
+        trajectory.states.assign(trajectory.rewards.size(), static_cast<float>(i));
+        trajectory.actions = trajectory.states;
+        relabel(trajectory, 1, 1, 1.0);
+        trajectories.push_back(trajectory);
+        at += trajectory.rewards.size();
+    }
+    const auto middle = trajectories.begin() + static_cast<ptrdiff_t>(initial);
+    buffer.start(offline_set({trajectories.begin(), middle}, c.whole("keep_lowest", 1, 0, 1) == 1));
+    for (auto next = middle; next != trajectories.end(); ++next) buffer.add(*next);
+    std::vector<float> order;
+    for (const Trajectory& trajectory : buffer.trajectories) order.push_back(trajectory.states[0]);
+    c.expect("order", {order.size()}, order);
+    if (!c.has("in/draws")) return;
+    const auto draws =
+        c.whole_in("draws", {any}, 0, buffer.ends.empty() ? -1 : static_cast<int64_t>(buffer.ends.back()) - 1);
+    std::vector<int> trajectory, start, length;
+    for (const int64_t draw : draws.values) {
+        const Window window = buffer.window_at(static_cast<uint64_t>(draw), context_length);
+        trajectory.push_back(static_cast<int>(window.trajectory));
+        start.push_back(window.start);
+        length.push_back(window.length);
+    }
+    c.expect("trajectory", draws.shape, trajectory);
+    c.expect("start", draws.shape, start);
+    c.expect("length", draws.shape, length);
+}
+
+// Two kinds: states [n, S] -> mean, deviation [S], normalised [n, S]; returns [m] and metadata CASE.task -> score [m].
+void check_normalize(Case& c) {
+    if (c.has("in/returns")) {
+        const auto returns = c.in<double>("returns", {any});
+        std::string tasks;
+        for (const MujocoTask& task : mujoco_tasks) tasks += (tasks.empty() ? "" : "|") + std::string(task.name);
+        const MujocoTask& task = *find_mujoco_task(c.word("task", tasks));
+        std::vector<double> score;
+        for (const double x : returns.values) score.push_back(normalised_score(task, x));
+        c.precision = Precision::float64;
+        return c.expect("score", returns.shape, score);
+    }
+    const auto states = c.in<float>("states", {any, any});
+    if (states.values.empty()) fail("check.shape", "%s: has no entry", c.where(c.need("in/states")).c_str());
+    Trajectory trajectory;
+    trajectory.states = states.values;
+    const Normaliser normaliser = fit_normaliser({trajectory}, states.extent(1));
+    std::vector<float> normalised;
+    for (size_t row = 0; row < states.shape[0]; ++row)
+        append_normalised(normalised, normaliser, &states.values[row * states.shape[1]]);
+    c.expect("mean", {states.shape[1]}, normaliser.mean);
+    c.expect("deviation", {states.shape[1]}, normaliser.deviation);
+    c.expect("normalised", states.shape, normalised, true);
+}
+
+// cell, move [m] -> next_cell; and by step(): state [m, S], reward, terminated [m]. Without them: the behaviour
+// policy's exact statistics, mean_length, sd_length, mean_return, sd_return.
+void check_gridworld(Case& c) {
+    const auto edge = static_cast<EdgeRule>(choice(edge_rule_names, c.word("edge", "clipped|stays|wraps|excluded")));
+    if (!c.has("in/cell")) {
+        const auto behaviour =
+            static_cast<Behaviour>(choice(behaviour_names, c.word("behaviour", "right_down|left_down")));
+        const ChainStatistics s = chain_statistics(behaviour, edge);
+        c.precision = Precision::float64;
+        c.expect("mean_length", {}, std::vector<double>{s.mean_length});
+        c.expect("mean_return", {}, std::vector<double>{s.mean_return});
+        c.expect("sd_length", {}, std::vector<double>{s.sd_length}, true);
+        c.expect("sd_return", {}, std::vector<double>{s.sd_return}, true);
+        return;
+    }
+    const auto cell = c.whole_in("cell", {any}, 0, grid_cells - 1);
+    const auto move = c.whole_in("move", cell.shape, 0, grid_moves - 1);
+    const bool steps = c.has("out/reward") || c.has("out/terminated") || c.has("out/state");
+    GridWorld world;
+    world.edge = edge;
+    world.encoding =
+        static_cast<StateEncoding>(choice(state_encoding_names, c.word("encoding", "coordinates|one_hot")));
+    std::vector<int> next, terminated;
+    std::vector<double> reward;
+    std::vector<float> state;
+    for (size_t i = 0; i < cell.values.size(); ++i) {
+        next.push_back(next_cell(edge, static_cast<int>(cell.values[i]), static_cast<int>(move.values[i])));
+        if (!steps) continue;
+        const float action = static_cast<float>(move.values[i]);
+        std::vector<float> observed(static_cast<size_t>(world.spec().state_dim));
+        world.cell = static_cast<int>(cell.values[i]);
+        const Step step = world.step(&action, observed.data());
+        reward.push_back(step.reward);
+        terminated.push_back(step.terminated);
+        state.insert(state.end(), observed.begin(), observed.end());
+    }
+    c.expect("next_cell", cell.shape, next);
+    if (!steps) return;
+    c.expect("reward", cell.shape, reward, true);
+    c.expect("terminated", cell.shape, terminated, true);
+    c.expect("state", {cell.shape[0], static_cast<uint64_t>(world.spec().state_dim)}, state, true);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topic: whole updates
+
+// How many updates a case wants: the largest N of after_N and the entries of the lists, or `updates`.
+int wanted_updates(Case& c) {
+    int most = 1;
+    for (const std::string& name : c.named("out/")) {
+        const size_t slash = name.find('/');
+        int number = 0;
+        const char* begin = name.data() + 6;
+        if (name.starts_with("after_") && slash != std::string::npos &&
+            std::from_chars(begin, name.data() + slash, number).ptr == name.data() + slash)
+            most = std::max(most, number);
+        for (const char* list : {"L", "H", "loss", "gradient_norm", "log_temperature"})
+            if (name == list)
+                for (const uint64_t extent : c.need("out/" + name).shape)
+                    most = std::max(most, static_cast<int>(std::min<uint64_t>(extent, 1 << 20)));
+    }
+    return static_cast<int>(c.whole("updates", most, most, 100000));
+}
+
+// How far float32's rounding of the gradients may have carried each parameter. Adam divides a gradient by its own size:
+// where that is near rounding, as in the keys' bias, which softmax does not see, the step is noise over noise. Entries
+// of a gradient are off by `off` at most, so are m and sqrt(v), and u = m / (sqrt(v) + epsilon) by (1 + |u|) off /
+// (sqrt(v) + epsilon), or by 2 where that is more; by LAMB's ratio the norm of all that reaches every entry.
+struct Slack {
+    std::vector<double> off;                  // [parameters] of the clipped gradients of all updates so far
+    std::vector<std::vector<double>> values;  // [parameters][size]
+
+    template <class T>
+    explicit Slack(const std::vector<Parameter<T>>& parameters) : off(parameters.size()) {
+        for (const Parameter<T>& parameter : parameters) values.emplace_back(parameter.value.size());
+    }
+
+    // After an update. before: the parameters; largest: |gradient| of each; scale: what clipping made of them.
+    void add(const std::vector<std::vector<float>>& before, const std::vector<double>& largest, double relative,
+             double scale, const Optimizer& optimizer, const OptimizerConfig& config) {
+        const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
+        const double bias1 = 1 - power(config.beta1, optimizer.updates),
+                     bias2 = 1 - power(config.beta2, optimizer.updates);
+        for (size_t p = 0; p < values.size(); ++p) {
+            off[p] = std::max(off[p], relative * scale * largest[p]);
+            const size_t n = values[p].size();
+            std::vector<double> u(n), du(n);
+            double squares_of_value = 0, squares_of_u = 0, squares_of_du = 0;
+            for (size_t i = 0; i < n; ++i) {
+                const double divisor = std::sqrt(optimizer.second_moment[p][i] / bias2) + config.epsilon;
+                u[i] = optimizer.first_moment[p][i] / bias1 / divisor;
+                du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
+                if (lamb) u[i] += config.weight_decay * before[p][i];
+                squares_of_value += static_cast<double>(before[p][i]) * before[p][i];
+                squares_of_u += u[i] * u[i];
+                squares_of_du += du[i] * du[i];
+            }
+            const bool adapts =
+                lamb && (config.weight_decay != 0 || config.always_adapt) && squares_of_value > 0 && squares_of_u > 0;
+            const double rate = config.learning_rate * warmup_factor(optimizer.updates - 1, config.warmup_updates) *
+                                (adapts ? std::sqrt(squares_of_value / squares_of_u) : 1);
+            const double ratio = adapts ? std::sqrt(squares_of_du / squares_of_u) : 0;
+            for (size_t i = 0; i < n; ++i) values[p][i] += rate * (du[i] + ratio * std::fabs(u[i]));
+        }
+    }
+};
+
+// parameter/NAME and the batch of read_windows() and read_batch(), noise [n, A] or [updates, n, A]: the same batch,
+// again and again. -> of the first update layer/NAME, layer_gradient/NAME, gradient/NAME; of every update L, H, loss,
+// gradient_norm and, after it, log_temperature; after_N/NAME: the parameters after N updates.
+template <class T>
+void check_step(Case& c) {
+    const auto model = read_model<T>(c);
+    const TransformerConfig& config = model->config;
+    const Windows windows = read_windows(c, config);
+    const Batch batch = read_batch(c, windows, config);
+    const bool constrain = config.head != Head::deterministic;
+    Settings settings;
+    settings.optimizer = c.word("optimizer", "lamb|adamw");
+    settings.learning_rate = c.number("learning_rate", 1e-4, 0, 1e9);
+    settings.weight_decay = c.number("weight_decay", 5e-4, 0, 1e9);
+    settings.lamb_always_adapt = c.whole("always_adapt", 0, 0, 1) == 1;
+    settings.clip_norm = c.number("clip_norm", 0.25, 0, 1e9);
+    settings.warmup_updates = c.whole("warmup_updates", 10000, 0, 1e9);
+    settings.lambda_learning_rate = c.number("lambda_learning_rate", 1e-4, 0, 1e9);
+    settings.eta = c.number("eta", -static_cast<double>(config.action_dim), -1e9, 1e9);
+    const double log_lambda = c.number("log_temperature", std::log(0.1), -50, 50);
+    const int updates = std::is_same_v<T, float> ? wanted_updates(c) : 1;
+    std::vector<float> noise;
+    size_t noise_stride = 0;
+    if (config.head == Head::squashed_gaussian) {
+        Shape shape = windows.rows_of(static_cast<uint64_t>(config.action_dim));
+        if (c.need("in/noise").shape.size() > shape.size()) {
+            noise_stride = batch.actions.size();
+            shape.insert(shape.begin(), static_cast<uint64_t>(wanted_updates(c)));
+        }
+        noise = c.in<float>("noise", shape).values;
+    }
+    Optimizer optimizer;
+
+    Temperature temperature(1);
+    temperature.log_lambda[0].value[0] = static_cast<float>(log_lambda);
+    Tape<T> tape(c.compute);
+    std::vector<double> L, H, loss, norms;
+    std::vector<float> log_temperature;
+    Slack slack(model->parameters);
+    for (int update = 1; update <= updates; ++update) {
+        tape.reset();
+        LayerOutputs<T> layers;
+        if (update == 1) layers.watch(tape);
+        const T lambda =
+            std::is_same_v<T, float> ? static_cast<T>(temperature.lambda()) : static_cast<T>(std::exp(log_lambda));
+        const Objective<T> result = learn(
+            tape, *model, batch, noise.data() + static_cast<size_t>(update - 1) * noise_stride, lambda, constrain);
+        tape.watch = nullptr;
+        L.push_back(static_cast<double>(result.L.value[0]));
+        H.push_back(constrain ? static_cast<double>(result.H.value[0]) : 0);
+        loss.push_back(static_cast<double>(result.lagrangian.value[0]));
+        for (const auto& output : layers.outputs) {
+            c.expect("layer/" + output.name, output.shape, output.value, true);
+            c.expect("layer_gradient/" + output.name, output.shape,
+                     std::vector<T>(output.gradient, output.gradient + output.value.size()), true);
+        }
+        if (update == 1)
+            for (const Parameter<T>& parameter : model->parameters)
+                c.expect("gradient/" + parameter.name, parameter.shape, parameter.gradient,
+                         c.named("out/gradient/").empty());
+        if constexpr (std::is_same_v<T, float>) {
+            std::vector<std::vector<float>> before;
+            std::vector<double> largest;
+            for (const Parameter<T>& parameter : model->parameters) {
+                before.push_back(parameter.value);
+                largest.push_back(0);
+                for (const float g : parameter.gradient)
+                    largest.back() = std::max<double>(largest.back(), std::fabs(g));
+            }
+            const OptimizerConfig optimizer_settings = optimizer_config(settings);
+            norms.push_back(update_parameters(c.compute, model->parameters, optimizer, optimizer_settings));
+            const double clipped = settings.clip_norm > 0 ? std::min(1.0, settings.clip_norm / norms.back()) : 1.0;
+            slack.add(before, largest, c.tolerance("gradient").float32, clipped, optimizer, optimizer_settings);
+            if (constrain) update_lambda(c.compute, temperature, settings, H.back());
+            log_temperature.push_back(temperature.log_lambda[0].value[0]);
+            const std::string after = "after_" + std::to_string(update) + "/";
+            if (c.named("out/" + after).empty()) continue;
+            for (size_t p = 0; p < model->parameters.size(); ++p)
+                c.expect(after + model->parameters[p].name, model->parameters[p].shape, model->parameters[p].value,
+                         false, false, slack.values[p]);
+        }
+    }
+    const auto list = [&](const char* name, const auto& values, bool optional) {
+        const bool scalar = c.has(std::string("out/") + name) && c.need(std::string("out/") + name).shape.empty();
+        using Values = std::decay_t<decltype(values)>;
+        if (scalar) return c.expect(name, {}, Values{values[0]}, optional);
+        c.expect(name, {values.size()}, values, optional, true);
+    };
+    list("loss", loss, false);
+    list("L", L, true);
+    if (constrain) list("H", H, true);
+    if (std::is_same_v<T, float>) list("gradient_norm", norms, true);
+    if (std::is_same_v<T, float> && constrain) list("log_temperature", log_temperature, true);
+    for (const std::string& name : c.named("out/"))
+        if (is_unused_parameter(name.substr(name.find('/') + 1))) c.find("out/" + name);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topics: the MuJoCo tasks
+
+// qpos [m, nq], qvel [m, nv], actions [m, A] or [m, T, A]: T steps from each state, after a reset; goal [2], physics.
+// -> qpos, qvel, observation, reward, terminated after each step, [m, ...] or [m, T, ...].
+void check_environment(Case& c) {
+    const std::string name = c.file.text("topic").substr(4);
+    const MujocoTask* task = find_mujoco_task(name);
+    if (!task || name != task->name)
+        fail("check.topic", "%s: unknown task \"%s\"; wodtem tasks lists them", c.file.path.c_str(), name.c_str());
+#ifdef WODTEM_MUJOCO
+    MujocoEnvironment environment(*task, static_cast<Physics>(choice(physics_names, c.word("physics", "d4rl|2.2"))));
+    const uint64_t nq = static_cast<uint64_t>(environment.model->nq), nv = static_cast<uint64_t>(environment.model->nv),
+                   A = static_cast<uint64_t>(task->action_dim), S = static_cast<uint64_t>(task->state_dim);
+    const auto qpos = c.in<double>("qpos", {any, nq}), qvel = c.in<double>("qvel", {qpos.shape[0], nv});
+    const bool several = c.need("in/actions").shape.size() == 3;
+    const auto actions = c.in<double>("actions", several ? Shape{qpos.shape[0], any, A} : Shape{qpos.shape[0], A});
+    if (c.has("in/goal")) {
+        const auto goal = c.in<double>("goal", {2});
+        environment.goal = {goal.values[0], goal.values[1]};
+    }
+    std::vector<double> after_qpos, after_qvel, observation, reward;
+    std::vector<int> terminated;
+    const auto append = [](std::vector<double>& to, const double* from, uint64_t n) {
+        to.insert(to.end(), from, from + n);
+    };
+    const size_t T = several ? actions.shape[1] : 1;
+    for (size_t i = 0; i < qpos.shape[0]; ++i) {
+        environment.start({&qpos.values[i * nq], nq}, {&qvel.values[i * nv], nv});
+        for (size_t t = 0; t < T; ++t) {
+            const Step step = environment.advance({&actions.values[(i * T + t) * A], A});
+            append(after_qpos, environment.data->qpos, nq);
+            append(after_qvel, environment.data->qvel, nv);
+            append(observation, environment.observation.data(), S);
+            reward.push_back(step.reward);
+            terminated.push_back(step.terminated);
+        }
+    }
+    Shape steps(actions.shape.begin(), actions.shape.end() - 1);
+    const auto rows = [&](uint64_t width) {
+        Shape shape = steps;
+        shape.push_back(width);
+        return shape;
+    };
+    c.expect("qpos", rows(nq), after_qpos, true);
+    c.expect("qvel", rows(nv), after_qvel, true);
+    c.expect("observation", rows(S), observation);
+    c.expect("reward", steps, reward);
+    c.expect("terminated", steps, terminated);
+#else
+    fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s",
+         c.file.path.c_str(), mujoco_advice);
+#endif
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Files
+
+struct Topic {
+    const char* name;  // env_: any task
+    void (*in_double)(Case&);
+    void (*in_float)(Case&);  // null: the code has one precision, and the other bound holds
+};
+constexpr Topic topics[] = {
+    {"rng", nullptr, check_rng},
+    {"returns", check_returns, nullptr},
+    {"linear", check_linear<double>, check_linear<float>},
+    {"layernorm", check_layernorm<double>, check_layernorm<float>},
+    {"mlp", check_mlp<double>, check_mlp<float>},
+    {"attention", check_attention<double>, check_attention<float>},
+    {"tokens", check_tokens<double>, check_tokens<float>},
+    {"policy_gaussian", check_policy_gaussian<double>, check_policy_gaussian<float>},
+    {"policy_discrete", check_policy_discrete<double>, check_policy_discrete<float>},
+    {"policy_deterministic", check_policy_deterministic<double>, check_policy_deterministic<float>},
+    {"memory_update", check_memory_update, nullptr},
+    {"memory_lookup", nullptr, check_memory_lookup},
+    {"memory_action", nullptr, check_memory_action},
+    {"weights", nullptr, check_weights},
+    {"objective", check_objective<double>, check_objective<float>},
+    {"optimizer", nullptr, check_optimizer},
+    {"sampling", check_sampling, nullptr},
+    {"normalize", nullptr, check_normalize},
+    {"gridworld", check_gridworld, nullptr},
+    {"step", check_step<double>, check_step<float>},
+    {"env_", check_environment, nullptr},
+};
+
+// The cases of a file, in its order. Errors: what has no case, or a case that the metadata does not count.
+std::vector<std::string> cases_of(const TensorFile& file) {
+    std::vector<std::string> cases;
+    const auto known = [&](const std::string& name) {
+        return std::find(cases.begin(), cases.end(), name) != cases.end();
+    };
+    for (const StoredTensor& tensor : file.tensors) {
+        const size_t slash = tensor.name.find('/');
+        const std::string name = tensor.name.substr(0, slash);
+        const std::string rest = slash == std::string::npos ? "" : tensor.name.substr(slash + 1);
+        if (name.empty() || name.find('.') != std::string::npos ||
+            !(rest.starts_with("in/") || rest.starts_with("out/")))
+            fail("check.name", "%s: tensor %s at byte %zu belongs to no case; names are CASE/in/NAME and CASE/out/NAME",
+                 file.path.c_str(), json_string(tensor.name).c_str(), file.data_start + tensor.begin);
+        if (!known(name)) cases.push_back(name);
+    }
+    for (const auto& [key, text] : file.metadata) {
+        const size_t dot = key.find('.');
+        if (dot != std::string::npos && !known(key.substr(0, dot)))
+            fail("check.case", "%s: metadata entry %s names a case of which the file has no tensor", file.path.c_str(),
+                 json_string(key).c_str());
+    }
+    const std::string& count = file.text("cases");
+    if (count != std::to_string(cases.size()))
+        fail("check.count", "%s: metadata entry \"cases\" says %s, the file has %zu", file.path.c_str(),
+             json_string(count.substr(0, 80)).c_str(), cases.size());
+    return cases;
+}
+
+std::string printable(std::string text) {  // a file may not drive the terminal
+    for (char& c : text)
+        if (static_cast<unsigned char>(c) < ' ' || c == 0x7F) c = '?';
+    return text;
+}
+
+std::string entry(const Case& c, const char* what) {
+    const auto found = c.file.metadata.find(c.name + "." + what);
+    return found == c.file.metadata.end() ? "" : printable(found->second);
+}
+
+// CASE.result: ok, or the id of the error that the case's inputs must raise.
+std::string expected_error(const Case& c) {
+    const std::string result = entry(c, "result");
+    return result == "ok" ? "" : result;
+}
+
+void print_inputs(const Case& c) {
+    std::printf("  case %s\n", c.name.c_str());
+    for (const char* what : {"note", "source", "tolerance"})
+        if (const std::string text = entry(c, what); !text.empty()) std::printf("    %s: %s\n", what, text.c_str());
+    for (const auto& [key, text] : c.file.metadata)
+        if (key.starts_with(c.name + ".") && !key.ends_with(".note") && !key.ends_with(".source") &&
+            !key.ends_with(".tolerance"))
+            std::printf("    %s = %s\n", printable(key.substr(c.name.size() + 1)).c_str(), printable(text).c_str());
+    for (const StoredTensor& tensor : c.file.tensors)
+        if (tensor.name.starts_with(c.name + "/in/"))
+            with_type(tensor.dtype, [&](auto type) {
+                std::vector<decltype(type)> values(tensor.size / sizeof type);
+                if (tensor.size > 0) std::memcpy(values.data(), c.file.bytes(tensor).data(), tensor.size);
+                Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, values);
+            });
+}
+
+// A case is computed by every function that its topic has; what none of them asked for is an error.
+void check_case(Case& c, const Topic& topic) {
+    if (c.verbose) print_inputs(c);
+    for (const char* what : {"note", "source", "result"}) c.used.insert(c.name + "." + what);
+    c.tolerance("");
+    if (c.named("out/").empty() && expected_error(c).empty())
+        fail("check.missing", "%s: case %s has no CASE/out/NAME: nothing is expected of it", c.file.path.c_str(),
+             json_string(c.name).c_str());
+    if (topic.in_float) {  // first: it finds out whether the inputs are floats
+        c.precision = Precision::float32;
+        topic.in_float(c);
+    }
+    if (topic.in_double && !(topic.in_float && c.rounded)) {
+        c.precision = Precision::float64;
+        topic.in_double(c);
+    }
+    for (const StoredTensor& tensor : c.file.tensors)
+        if (tensor.name.starts_with(c.name + "/") && !c.used.contains(tensor.name))
+            fail("check.unknown", "%s: is unknown to topic %s; tests/vectors/README.md lists its tensors",
+                 c.where(tensor).c_str(), topic.name);
+    for (const auto& [key, text] : c.file.metadata) {
+        if (!key.starts_with(c.name + ".") || c.used.contains(key)) continue;
+        const std::string start = c.name + ".tolerance.";
+        const bool of_output = key.starts_with(start) && !c.named("out/" + key.substr(start.size())).empty();
+        if (!of_output)
+            fail("check.unknown",
+                 "%s: metadata entry %s is unknown to topic %s; tests/vectors/README.md lists its "
+                 "settings",
+                 c.file.path.c_str(), json_string(key).c_str(), topic.name);
+    }
+}
+
+// Prints a line, and more of what does not hold. Returns whether all does. Errors: what makes the file none of vectors.
+bool check_file(const std::string& path, Compute& compute, bool verbose) {
+    const TensorFile file = read_safetensors(path);
+    const std::string& name = file.text("topic");
+    const Topic* topic = nullptr;
+    for (const Topic& t : topics)
+        if (name == t.name || (std::string_view(t.name) == "env_" && name.starts_with("env_"))) topic = &t;
+    if (!topic)
+        fail("check.topic", "%s: unknown topic %s; known are those of tests/vectors/README.md", path.c_str(),
+             json_string(name.substr(0, 80)).c_str());
+    double worst = 0;
+    std::vector<Case> failed;
+    bool rounded = false;
+    const std::vector<std::string> cases = cases_of(file);
+    if (verbose) std::printf("%s: topic %s\n", path.c_str(), printable(name).c_str());
+    for (const std::string& case_name : cases) {
+        Case c{file, case_name, compute, verbose};
+        try {
+            check_case(c, *topic);
+        } catch (const Error& error) {
+            if (error.id == expected_error(c)) continue;
+            if (error.id.starts_with("check.") || error.id.starts_with("safetensors.")) throw;
+            fail(error.id.c_str(), "%s: case %s: %s", path.c_str(), json_string(case_name).c_str(), error.what());
+        }
+        if (!expected_error(c).empty()) c.problems.push_back("expected the error " + expected_error(c) + ", none came");
+        worst = std::max(worst, c.worst);
+        rounded |= c.rounded;
+        if (!c.problems.empty()) failed.push_back(c);
+    }
+    std::printf("%-44s %3zu cases, %zu failed, worst error %.2g of what is allowed%s\n", path.c_str(), cases.size(),
+                failed.size(), worst, rounded ? " (inputs rounded to float32)" : "");
+    for (const Case& c : failed) {
+        std::printf("  case %s does not hold: %s\n", c.name.c_str(), entry(c, "note").c_str());
+        for (size_t i = 0; i < std::min<size_t>(c.problems.size(), 10); ++i)
+            std::printf("    %s\n", c.problems[i].c_str());
+        if (c.problems.size() > 10) std::printf("    and %zu more tensors\n", c.problems.size() - 10);
+    }
+    return failed.empty();
+}
+
+}  // namespace vectors
+
+void command_check(const Arguments& arguments) {
+    Compute compute(choose_kernel(arguments["--kernel"]), thread_count(arguments));
+    size_t bad = 0;
+    for (const std::string& path : arguments.words) {
+        try {
+            bad += !vectors::check_file(path, compute, arguments["-v"] == "yes");
+        } catch (const Error& error) {
+            std::fflush(stdout);
+            std::fprintf(stderr, "wodtem: %s\n", error.what());
+            ++bad;
+        }
+    }
+    if (bad > 0) fail("check.failed", "%zu of %zu files do not hold", bad, arguments.words.size());
+}
