@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <bit>
 #include <cmath>
 #include <cstdarg>
 #include <cstddef>
@@ -295,11 +296,8 @@ void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int
 // exact as float). The definition, for the order of additions: C takes in 32 k at a time, for these the products of
 // parts in turn, of each the sum over even k and the sum over odd k, added up from zero in order of k.
 inline float bf16_nearest(float x) {  // ties to even; infinity and the NaN that arithmetic makes stay what they are
-    uint32_t bits;
-    std::memcpy(&bits, &x, sizeof bits);
-    bits = (bits + (bits >> 16 & 1) + 0x7FFF) & 0xFFFF0000;
-    std::memcpy(&x, &bits, sizeof bits);
-    return x;
+    const uint32_t bits = std::bit_cast<uint32_t>(x);
+    return std::bit_cast<float>((bits + (bits >> 16 & 1) + 0x7FFF) & 0xFFFF0000);
 }
 
 // Part j of B that meets part i of A in turn n < parts - i: back and forth, small products first, so that most turns
@@ -490,9 +488,11 @@ ALWAYS_INLINE void split_pairs(uint16_t* to, const float* x, const float* y, ptr
             rest[i] -= Float16(top[i] & 0xFFFF0000);
         }
         const Words both = top[0] >> 16 | (top[1] & 0xFFFF0000);
-        const Halves halves[2] = {__builtin_convertvector(top[0] >> 16, Halves),
-                                  __builtin_convertvector(top[1] >> 16, Halves)};
-        std::memcpy(to, interleaved ? static_cast<const void*>(&both) : halves, sizeof both);
+        if (interleaved) std::memcpy(to, &both, sizeof both);
+        for (int i = 0; !interleaved && i < 2; ++i) {
+            const Halves half = __builtin_convertvector(top[i] >> 16, Halves);
+            std::memcpy(to + 16 * i, &half, sizeof half);
+        }
     }
 }
 
@@ -536,40 +536,30 @@ EACH_TARGET void pack_parts(void* panel, View<const float> view, int first_k, in
     pack_parts_of<Parts, OfB, false>(to, view, first_k, first_w, depth, used);
 }
 
-// What AMX does, in C++: quarters of a tile of C, [16, 16] each, and two tiles each of A and B. It is the definition's
-// inner loop (Intel's manual on TDPBF16PS; AMX takes subnormal numbers for zero).
+// What AMX does, in C++: a tile of C and 32 k of A and B, the definition's inner loop (Intel's manual on TDPBF16PS; AMX
+// takes subnormal numbers for zero).
 struct TilesInSoftware {
-    float c[4][256];
+    float c[32][32];
     const uint16_t *a = nullptr, *b = nullptr;
     static void prepare(bool) {}
     void clear() { std::memset(c, 0, sizeof c); }
     void load_c(const float* from, ptrdiff_t stride) {
-        for (int i = 0; i < 64; ++i)
-            std::memcpy(&c[i / 32 * 2 + i % 2][i % 32 / 2 * 16], from + i / 2 * stride + i % 2 * 16, 64);
+        for (int row = 0; row < 32; ++row) std::copy_n(from + row * stride, 32, c[row]);
     }
     void store_c(float* to, ptrdiff_t stride) const {
-        for (int i = 0; i < 64; ++i)
-            std::memcpy(to + i / 2 * stride + i % 2 * 16, &c[i / 32 * 2 + i % 2][i % 32 / 2 * 16], 64);
+        for (int row = 0; row < 32; ++row) std::copy_n(c[row], 32, to + row * stride);
     }
     void load_a(const uint16_t* from) { a = from; }
     void load_b(const uint16_t* from) { b = from; }
-    static float widened(uint16_t part) {
-        const uint32_t bits = uint32_t{part} << 16;
-        float x;
-        std::memcpy(&x, &bits, sizeof x);
-        return x;
-    }
     void multiply() {
-        for (int quarter = 0; quarter < 4; ++quarter)
-            for (int row = 0; row < 16; ++row) {
-                const uint16_t *line = a + quarter / 2 * 512 + row * 32, *pairs = b + quarter % 2 * 512;
-                float even[16] = {}, odd[16] = {};
-                for (int pair = 0; pair < 16; ++pair, pairs += 32)
-                    for (int j = 0; j < 16; ++j) {
-                        even[j] += widened(line[2 * pair]) * widened(pairs[2 * j]);
-                        odd[j] += widened(line[2 * pair + 1]) * widened(pairs[2 * j + 1]);
-                    }
-                for (int j = 0; j < 16; ++j) c[quarter][row * 16 + j] += even[j] + odd[j];
+        const auto widened = [](uint16_t part) { return std::bit_cast<float>(uint32_t{part} << 16); };
+        for (int row = 0; row < 32; ++row)
+            for (int half = 0; half < 2; ++half) {
+                float sums[32] = {};  // of even and odd k by turns
+                for (int pair = 0; pair < 16; ++pair)
+                    for (int j = 0; j < 32; ++j)
+                        sums[j] += widened(a[32 * row + 2 * pair + j % 2]) * widened(b[512 * half + 32 * pair + j]);
+                for (int j = 0; j < 16; ++j) c[row][16 * half + j] += sums[2 * j] + sums[2 * j + 1];
             }
     }
 };
