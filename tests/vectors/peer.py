@@ -152,6 +152,11 @@ def rng():
            f"float32 {8 * 2 * math.pi * U:.2g}: the angle, up to 2 pi, is rounded three times, and each function once",
            CLOSED, draws, {"normal": np.array([math.sqrt(-2 * math.log(a)) * math.cos(b) for a, b in zip(u, angle)])},
            **setting)
+    probability, place, update = float(np.float32(0.1)), 7, 2**32 + 5
+    bits = [w for i in range(25) for w in philox([i, place, update & ones, update >> 32], [seed, 2])]
+    f.case("dropout", "one word for each element, not one counter; kept elements are scaled up", f"float32 {2 * U:.2g}: one quotient",
+           CLOSED, {}, {"dropout": np.array([0.0 if b < int(probability * 2**32) else 1 / (1 - probability) for b in bits[:98]])},
+           seed=seed, stream=2, probability=repr(probability), place=place, update=update)
     f.save()
 
 
