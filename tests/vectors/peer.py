@@ -152,6 +152,11 @@ def rng():
            f"float32 {8 * 2 * math.pi * U:.2g}: the angle, up to 2 pi, is rounded three times, and each function once",
            CLOSED, draws, {"normal": np.array([math.sqrt(-2 * math.log(a)) * math.cos(b) for a, b in zip(u, angle)])},
            **setting)
+    probability, place, update = float(np.float32(0.1)), 7, 2**32 + 5
+    bits = [w for i in range(25) for w in philox([i, place, update & ones, update >> 32], [seed, 2])]
+    f.case("dropout", "one word for each element, not one counter; kept elements are scaled up", f"float32 {2 * U:.2g}: one quotient",
+           CLOSED, {}, {"dropout": np.array([0.0 if b < int(probability * 2**32) else 1 / (1 - probability) for b in bits[:98]])},
+           seed=seed, stream=2, probability=repr(probability), place=place, update=update)
     f.save()
 
 
@@ -1158,12 +1163,13 @@ def normalize():
 
     def case(name, note, states):
         mean, deviation = states.mean(0), np.sqrt(((states - states.mean(0))**2).mean(0)) + 1e-6
-        worst = float(max(1.0, (np.abs(states).max(0) / deviation).max()))
+        varies = deviation > 1e-5  # elsewhere all states are the mean, exactly
+        worst = float(max([1.0, *(np.abs(states).max(0) / deviation)[varies]]))
         y = (states - mean) / deviation
         f.case(name, note, f"float32 {2 * U:.2g}: computed in double, rounded once", NUMPY, {"states": states},
                {"mean": mean, "deviation": deviation, "normalised": y})
-        f.tolerance(name, "normalised", f"float32 {4 * worst * U / max(1e-9, np.abs(y).max()):.2g}, absolute 1e-12: float32 states less a "
-                    "rounded mean: what cancels is lost")
+        f.tolerance(name, "normalised", f"float32 {4 * worst * U / (np.abs(y).max() or 1):.2g}: float32 states less a rounded mean: "
+                    "what cancels is lost")
 
     case("states", "population deviation (1/n), 1e-6 added to it, not under the root", paint(1, 12, 3))
     constant = paint(1, 6, 3)
