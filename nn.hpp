@@ -326,7 +326,7 @@ inline void matmul_parts_plain(View<float> c, View<const float> a, View<const fl
 }
 
 // One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns] (row stride b_stride), depth <=
-// sum_block. Writes (`add`: adds) the upper left rows x columns of the tile to c.
+// kernel.depth. Writes (`add`: adds) the upper left rows x columns of the tile to c.
 using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int b_stride, int depth, int rows,
                               int columns, bool add);
 
@@ -345,8 +345,10 @@ struct Kernel {
     PackFunction pack_a, pack_b;
     TileFunction tile;
     void (*prepare)(bool begin);  // called before and after a thread works on tiles
-    size_t panel_bytes(int width, int depth) const {
-        const int elements = width * (parts > 0 ? (depth + 31) / 32 * 32 : depth);
+    // k at a time: as the definition has it for floats; for parts C takes in what comes, and panels of 32 kB are best.
+    int depth() const { return parts > 0 ? 512 / parts / 32 * 32 : sum_block; }
+    size_t panel_bytes(int width, int k) const {
+        const int elements = width * (parts > 0 ? (k + 31) / 32 * 32 : k);
         return static_cast<size_t>(elements) * (parts > 0 ? 2 * static_cast<size_t>(parts) : sizeof(float));
     }
 };
@@ -718,13 +720,13 @@ struct Compute {
     static constexpr int block_tiles = 8;  // tiles of rows of A that a task packs: they stay in a core's second cache
     const Kernel& kernel;
     Threads threads;
-    std::vector<Line> packed_b;               // one sum block of B, in panels of tile_columns
+    std::vector<Line> packed_b;               // a stretch of B, in panels of tile_columns
     std::vector<std::vector<Line>> packed_a;  // one per worker
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
           packed_a(static_cast<size_t>(thread_count),
-                   std::vector<Line>(lines_for(chosen.panel_bytes(block_tiles * chosen.tile_rows, sum_block)))) {}
+                   std::vector<Line>(lines_for(chosen.panel_bytes(block_tiles * chosen.tile_rows, chosen.depth())))) {}
 };
 
 inline int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
@@ -734,7 +736,7 @@ struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
-// The product of a block of rows with panels of B, for one sum block.
+// The product of a block of rows with panels of B, for one stretch of k.
 inline void matmul_block(const Kernel& kernel, char* packed_a, View<float> c, View<const float> a, View<const float> b,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
@@ -784,7 +786,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, N / (4 * kernel.tile_columns)));
     const int block_columns = round_up((N + column_blocks - 1) / column_blocks, kernel.tile_columns);
     if (pack_b) {
-        const size_t lines = lines_for(kernel.panel_bytes(round_up(N, kernel.tile_columns), std::min(K, sum_block)));
+        const size_t lines =
+            lines_for(kernel.panel_bytes(round_up(N, kernel.tile_columns), std::min(K, kernel.depth())));
         if (compute.packed_b.size() < lines) compute.packed_b.resize(lines);
     }
     char* const packed_b = pack_b ? compute.packed_b[0].bytes : nullptr;
@@ -794,8 +797,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
         else
             compute.threads.run(tasks, body);
     };
-    for (int first_k = 0; first_k < K; first_k += sum_block) {
-        const int depth = std::min(sum_block, K - first_k);
+    for (int first_k = 0; first_k < K; first_k += kernel.depth()) {
+        const int depth = std::min(kernel.depth(), K - first_k);
         const int panels = (N + kernel.tile_columns - 1) / kernel.tile_columns;
         const int panels_a_task = threads == 1 ? panels : std::max(1, panels / 8);
         if (pack_b)
