@@ -15,6 +15,7 @@
 #include <functional>
 #include <numbers>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 #include "../mujoco_env.hpp"
@@ -174,11 +175,14 @@ constexpr uint32_t start = 11, goal_cell = 13, goal = 14;
 
 // Each row's reward and terminal tell whether the next row's observation is within 0.5 m of one goal for all rows:
 // across boundaries this looks into the next episode, as D4RL's script does. The last row has none after it: 0.
-inline void relabel(AntMazeSet& set, std::array<double, 2> goal) {
+// `once`: of each run of ones the first alone stays, as is reported of umaze-diverse's file; umaze's has whole runs.
+inline void relabel(AntMazeSet& set, std::array<double, 2> goal, bool once) {
     set.rewards.assign(set.length(), 0);
+    bool inside = false;
     for (size_t row = 0; row + 1 < set.length(); ++row) {
         const float* next = &set.observations[29 * (row + 1)];
-        set.rewards[row] = std::hypot(next[0] - goal[0], next[1] - goal[1]) <= goal_radius;
+        const bool was = std::exchange(inside, std::hypot(next[0] - goal[0], next[1] - goal[1]) <= goal_radius);
+        set.rewards[row] = inside && !(once && was);
     }
     set.terminals = set.rewards;
 }
@@ -261,7 +265,7 @@ inline AntMazeSet collect_ant_maze_set(const MujocoTask& task, size_t steps, uin
         if (progress) progress(set.length());
     }
     environment.reset(resets, data_set_episodes - 1, state.data());  // whose goal no episode has
-    relabel(set, environment.goal);
+    relabel(set, environment.goal, diverse);
     return set;
 }
 

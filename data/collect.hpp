@@ -27,6 +27,7 @@
     extern "C" const char name[], name##_end[];
 WODTEM_EMBED(wodtem_hopper_medium, "data/policies/hopper-medium.safetensors")
 WODTEM_EMBED(wodtem_halfcheetah_medium, "data/policies/halfcheetah-medium.safetensors")
+WODTEM_EMBED(wodtem_antmaze_walker, "data/policies/antmaze-walker.safetensors")
 #undef WODTEM_EMBED
 
 // A policy that this program holds: "hopper-medium", or "antmaze-walker". Errors: collect.policy.
@@ -34,10 +35,9 @@ inline sac::SavedPolicy embedded_policy(const std::string& name) {
     struct Embedded {
         const char *name, *begin, *end;
     };
-    constexpr std::array<Embedded, 2> all{
-        {{"hopper-medium", wodtem_hopper_medium, wodtem_hopper_medium_end},
-         {"halfcheetah-medium", wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end}}};
-    for (const Embedded& one : all)
+    for (const Embedded& one : {Embedded{"hopper-medium", wodtem_hopper_medium, wodtem_hopper_medium_end},
+                                {"halfcheetah-medium", wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end},
+                                {walker_name, wodtem_antmaze_walker, wodtem_antmaze_walker_end}})
         if (name == one.name)
             return sac::policy_of(parse_safetensors(std::string(one.begin, one.end), "the policy " + name));
     fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
@@ -103,7 +103,7 @@ inline Training gym_training(const MujocoTask& task, uint32_t seed, size_t rows)
 
 // departs from D4RL's policies: half their width, for a third of the time.
 inline Training walker_training(uint32_t seed) {
-    Training training{walker_name, {}, 400};  // m/s summed over 500 steps
+    Training training{walker_name, {}, 400};  // 0.8 m/s over 500 steps
     training.settings.seed = seed;
     training.settings.batch = 128;
     training.settings.hidden = 128;

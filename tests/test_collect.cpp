@@ -197,10 +197,12 @@ TEST(ant_maze_rewards_test_the_next_row_against_one_goal) {
     const std::array<std::array<float, 2>, 5> places = {{{0, 0}, {3.5f, 4}, {3.51f, 4}, {4, 3.4f}, {4, 4}}};
     for (size_t row = 0; row < 5; ++row) std::copy_n(places[row].begin(), 2, &set.observations[29 * row]);
     set.timeouts[2] = 1;  // the next row is another episode's: tested all the same
-    relabel(set, {4, 4});
+    relabel(set, {4, 4}, false);
     CHECK(set.rewards == (std::vector<float>{1, 1, 0, 1, 0}));
     CHECK(set.terminals == set.rewards);
-    relabel(set, {40, 4});
+    relabel(set, {4, 4}, true);  // the first of a run alone
+    CHECK(set.rewards == (std::vector<float>{1, 0, 0, 1, 0}));
+    relabel(set, {40, 4}, false);
     CHECK(set.rewards == std::vector<float>(5));
 }
 
