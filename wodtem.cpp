@@ -1378,6 +1378,11 @@ struct Console {
 
     // share: of the phase, 0 to 1.
     void show(const Run& run, const std::string& new_phase, double share) {
+        show(new_phase, share, [&] { return numbers(run, Clock::now()); });
+    }
+
+    template <class Numbers>
+    void show(const std::string& new_phase, double share, Numbers&& numbers_now) {
         const Clock::time_point now = Clock::now();
         if (phase != new_phase) phase = new_phase, first_share = share, tenth = -1, started = now;
         const int new_tenth = static_cast<int>(share * 10);
@@ -1389,7 +1394,7 @@ struct Console {
             const double left = seconds_between(started, now) / (share - first_share) * (1 - share);
             text += " " + clock_text(static_cast<int>(std::min(left, 3599999.0))) + " left,";
         }
-        text += numbers(run, now);
+        text += numbers_now();
         if (terminal) text.resize(std::min(text.size(), columns() - 1));  // a line that wraps cannot be drawn over
         std::fprintf(stderr, terminal ? "\r%s\033[K%s" : "%s%s\n", text.c_str(), terminal && share >= 1 ? "\n" : "");
     }
@@ -1821,13 +1826,17 @@ std::string default_folder(const Settings& settings) {
            std::to_string(settings.seed);
 }
 
-void command_train(const Arguments& arguments) {
+void stop_on_signals() {
     for (const int signal : {SIGINT, SIGTERM}) {
         std::signal(signal, [](int number) {
             stop_requested = 1;
             std::signal(number, SIG_DFL);  // a second one ends the process at once
         });
     }
+}
+
+void command_train(const Arguments& arguments) {
+    stop_on_signals();
     const int threads = thread_count(arguments);
     const int64_t checkpoint_every = whole_number(arguments["--checkpoint-every"], "--checkpoint-every", 0, 86400);
     const bool several = !arguments["--seeds"].empty();
@@ -1889,50 +1898,77 @@ void command_eval(const Arguments& arguments) {
                      [&](const auto& environment) { evaluate_model(environment, settings, file, arguments); });
 }
 
-// Steps of D4RL's own sets.
-int64_t published_steps(const std::string& id) {
-    return id == "maze2d-large-v1" ? 4000000 : id == "maze2d-medium-v1" ? 2000000 : 1000000;
+#ifdef WODTEM_MUJOCO
+void make_folder(const fs::path& folder) {
+    std::error_code problem;
+    fs::create_directories(folder, problem);
+    if (problem) fail("collect.folder", "cannot make the folder %s: %s", folder.c_str(), problem.message().c_str());
 }
+
+// A stand-in for the data set `id`, or the policy that walks through antmaze, at `path`.
+void collect(const std::string& id, const std::string& path, size_t steps, const Origin& origin,
+             const std::string& policy_path) {
+    Console console;
+    console.label = id;
+    const auto show = [&](size_t done) {
+        const double share = static_cast<double>(done) / static_cast<double>(steps);
+        console.show("collecting", std::min(share, 1.0),
+                     [&] { return " row " + std::to_string(std::min(done, steps)); });
+    };
+    const MujocoTask* task = find_mujoco_task(id);
+    const auto policy = [&](const std::string& name) {
+        return policy_path.empty() ? embedded_policy(name) : sac::load_policy(policy_path);
+    };
+    const bool walker = id == walker_name, trains = walker || id.find("-medium-replay") != std::string::npos;
+    if (!trains && task->rules == Rules::maze2d) return collect_maze2d(path, *task, steps, origin, show);
+    if (!trains && task->rules == Rules::antmaze)
+        return collect_antmaze(path, *task, steps, origin, policy(walker_name), show);
+    if (!trains) return collect_medium(path, *task, steps, origin, policy(std::string(task->name) + "-medium"), show);
+
+    const std::string folder = path + ".training";
+    make_folder(folder);
+    const FolderLock lock(folder);
+    stop_on_signals();
+    const Watch watch{
+        [&](double share, const std::string& numbers) { console.show("training", share, [&] { return numbers; }); },
+        [] { return stop_requested != 0; }};
+    if (walker)
+        train_walker(path, walker_training(origin.seed), folder + "/checkpoint.safetensors", watch);
+    else
+        collect_medium_replay(path, *task, steps, origin, gym_training(*task, origin.seed, steps),
+                              folder + "/checkpoint.safetensors", watch);
+    fs::remove_all(folder);
+}
+#endif
 
 void command_collect(const Arguments& arguments) {
     const std::string id = full_task_name(arguments.words[0]);
     const PublishedDataSet* set = find_published(id);
-    if (!set) {
-        std::vector<std::string> names;
+    const bool walker = id == walker_name;
+    if (!set && !walker) {
+        std::vector<std::string> names = {walker_name};
         for (const PublishedDataSet& one : published_data_sets) names.push_back(one.id);
         fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none; the nearest is %s", id.c_str(),
              nearest_name(id, names).c_str());
     }
     [[maybe_unused]] const int64_t steps = arguments["--steps"].empty()
-                                               ? published_steps(id)
+                                               ? static_cast<int64_t>(walker ? 0 : set->steps)
                                                : whole_number(arguments["--steps"], "--steps", 1, 100000000);
-    [[maybe_unused]] const int64_t seed =
-        whole_number(arguments["--seed"].empty() ? "0" : arguments["--seed"], "--seed", 0, 2147483647);
-    const std::string path =
-        arguments["--out"].empty() ? std::string(own_folder) + "/" + file_name(*set) : arguments["--out"];
+    [[maybe_unused]] const int64_t seed = whole_number(arguments["--seed"], "--seed", 0, 2147483647);
+    const std::string path = !arguments["--out"].empty()
+                                 ? arguments["--out"]
+                                 : std::string(own_folder) + "/" + (walker ? id + ".safetensors" : file_name(*set));
 #ifdef WODTEM_MUJOCO
-    std::error_code problem;
     const fs::path folder = fs::path(path).parent_path();
-    if (!folder.empty()) fs::create_directories(folder, problem);
-    if (problem) fail("collect.folder", "cannot make the folder %s: %s", folder.c_str(), problem.message().c_str());
-    int tenth = 0;
-    const auto show = [&](size_t done) {
-        const int now = static_cast<int>(10 * static_cast<double>(done) / static_cast<double>(steps));
-        if (now > tenth && now <= 10) std::fprintf(stderr, "%s: %d%%\n", id.c_str(), 10 * now);
-        tenth = std::max(tenth, now);
-    };
+    if (!folder.empty()) make_folder(folder);
     const Origin origin{
         "wodtem collect " + id + " --steps " + std::to_string(steps) + " --seed " + std::to_string(seed),
         static_cast<uint32_t>(seed)};
-    const MujocoTask& task = *find_mujoco_task(id);
-    if (!has_stand_in(id))
-        fail("collect.task", "%s cannot be made by this version; maze2d, hopper-medium and halfcheetah-medium can",
-             id.c_str());
-    if (task.rules == Rules::maze2d)
-        collect_maze2d(path, task, static_cast<size_t>(steps), origin, show);
+    collect(id, path, static_cast<size_t>(steps), origin, arguments["--policy"]);
+    if (walker)
+        std::printf("%s: the policy; wodtem collect antmaze-umaze --policy %s\n", path.c_str(), path.c_str());
     else
-        collect_medium(path, task, static_cast<size_t>(steps), origin, show);
-    std::printf("%s: %lld steps; see: wodtem info %s\n", path.c_str(), static_cast<long long>(steps), path.c_str());
+        std::printf("%s: %lld steps; see: wodtem info %s\n", path.c_str(), static_cast<long long>(steps), path.c_str());
 #else
     fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s", path.c_str(),
          mujoco_advice);
@@ -2131,7 +2167,9 @@ void describe_data_set(const std::string& path, std::string id) {
         std::printf("mean normalised score of a trajectory: %.2f (%s)\n",
                     normalised_score(*task, statistics.returns.mean()), task->name);
     const PublishedDataSet* set = find_published(id);
-    if (set && set->trajectories > 0)
+    if (set && set->trajectories > 0 && std::isnan(set->deviation))
+        std::printf("D4RL's: %d trajectories, mean return %.2f\n", set->trajectories, set->mean_return);
+    else if (set && set->trajectories > 0)
         std::printf("D4RL's: %d trajectories, returns: mean %.2f, deviation %.2f, %.2f to %.2f\n", set->trajectories,
                     set->mean_return, set->deviation, set->low, set->high);
 }
@@ -2238,7 +2276,8 @@ const std::vector<Command>& commands() {
          "make a stand-in for one of D4RL's data sets, in its layout",
          {{"--out", "FILE", "", "where to write (default: runs/datasets under D4RL's file name)"},
           {"--steps", "N", "", "rows (default: as many as D4RL's)"},
-          seed_option},
+          {"--policy", "FILE", "", "of a medium or antmaze set (default: the one that this program holds)"},
+          {"--seed", "N", "0", "of all that is drawn"}},
          command_collect},
         {"trace",
          "TASK",
@@ -2318,6 +2357,14 @@ void print_help(const Command* command) {
             "  goal,X,Y        mazes: the goal from here on, in observed coordinates\n"
             "  ...,...         an action as a policy gives it; answered by one line: obs...,reward,done\n"
             "Nothing ends an episode but the next init.\n");
+    if (std::string(command->name) == "collect") {
+        std::printf("\nID, rows, and how long it takes on one core:\n");
+        for (const PublishedDataSet& set : published_data_sets)
+            std::printf("  %-30s %8zu  %s\n", set.id, set.steps,
+                        set.collected_in ? set.collected_in : "needs --policy, which its medium-replay set ends with");
+        std::printf("  %-30s %8s  the policy of the antmaze sets, trained anew; 10 minutes\n", walker_name, "");
+        std::printf("A training that was stopped goes on with the same command.\n");
+    }
     if (std::string(command->name) == "train") {
         std::printf("\nSettings for --set, with the values of preset paper:\n");
         const Settings settings;

@@ -41,7 +41,8 @@ struct Settings {
     int batch = 256;
     uint64_t capacity = 1000000;  // transitions; the oldest make room
     uint64_t random_steps = 10000;
-    double learning_rate = 3e-4;  // Adam's, of policy, critics and temperature
+    uint64_t steps_per_update = 1;  // of the environment
+    double learning_rate = 3e-4;    // Adam's, of policy, critics and temperature
     double discount = 0.99;
     double target_rate = 5e-3;
     double reward_scale = 1;
@@ -356,10 +357,12 @@ struct Episode {
     double total = 0;      // undiscounted
 };
 
-// One episode up to termination or the time limit; before_step() is called with the environment still at states[t].
-template <class Environment, class BeforeStep>
+// One episode up to termination or the time limit; before_step() is called with the environment still at states[t],
+// after_step(action, Step) where it led.
+template <class Environment, class BeforeStep,
+          class AfterStep = decltype([](const std::vector<float>&, const Step&) {})>
 Episode play(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed, uint64_t number,
-             bool sampled, BeforeStep&& before_step) {
+             bool sampled, BeforeStep&& before_step, AfterStep&& after_step = {}) {
     const EnvironmentSpec spec = environment.spec();
     const Random random{seed, Stream::exploration};
     Episode episode;
@@ -374,6 +377,7 @@ Episode play(Tape<float>& tape, Network<float>& policy, Environment& environment
             episode.actions.insert(episode.actions.end(), action.begin(), action.end());
             before_step();
             const Step step = environment.step(action.data(), state.data());
+            after_step(action, step);
             episode.rewards.push_back(static_cast<float>(step.reward));
             episode.total += step.reward;
             episode.terminated = step.terminated;
@@ -445,15 +449,26 @@ struct Learner {
           targets(critics),
           log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}},
           replay{e.state_dim, e.action_dim, s.capacity} {
-        if (e.moves != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1)
-            fail("sac.settings", "SAC needs continuous actions, a batch and a replay of at least one episode (%d)",
-                 e.max_episode_steps);
+        if (e.moves != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1 ||
+            s.steps_per_update < 1)
+            fail(
+                "sac.settings",
+                "SAC needs continuous actions, a batch, steps between updates and a replay of at least one episode (%d)",
+                e.max_episode_steps);
         replay.rows.reserve(s.capacity * replay.width());  // untouched until it is needed
     }
 
-    // One step of the environment, and after the first random ones an update.
+    // One step of the environment, and after the first random ones an update if its turn has come.
     template <class Environment>
     void step(Environment& environment) {
+        interact(environment);
+        if (progress.steps > settings.random_steps && progress.steps % settings.steps_per_update == 0 &&
+            replay.size() > 0)
+            update();
+    }
+
+    template <class Environment>
+    void interact(Environment& environment) {
         Progress& p = progress;
         if (p.episode_steps == 0)
             environment.reset(Random{settings.seed, Stream::environment}, p.episodes, state.data());
@@ -479,7 +494,6 @@ struct Learner {
             p.episode_steps = 0;
             ++p.episodes;
         }
-        if (p.steps > settings.random_steps && replay.size() > 0) update();
     }
 
     void choose_action() {
@@ -597,11 +611,13 @@ inline std::string settings_text(const Learner& learner) {
     const Settings& s = learner.settings;
     char text[400];
     std::snprintf(text, sizeof text,
-                  "seed=%u hidden=%d batch=%d capacity=%llu random_steps=%llu learning_rate=%.17g discount=%.17g "
+                  "seed=%u hidden=%d batch=%d capacity=%llu random_steps=%llu steps_per_update=%llu "
+                  "learning_rate=%.17g discount=%.17g "
                   "target_rate=%.17g reward_scale=%.17g state_dim=%d action_dim=%d max_episode_steps=%d kernel=%s",
                   s.seed, s.hidden, s.batch, static_cast<unsigned long long>(s.capacity),
-                  static_cast<unsigned long long>(s.random_steps), s.learning_rate, s.discount, s.target_rate,
-                  s.reward_scale, learner.spec.state_dim, learner.spec.action_dim, learner.spec.max_episode_steps,
+                  static_cast<unsigned long long>(s.random_steps), static_cast<unsigned long long>(s.steps_per_update),
+                  s.learning_rate, s.discount, s.target_rate, s.reward_scale, learner.spec.state_dim,
+                  learner.spec.action_dim, learner.spec.max_episode_steps,
                   learner.learning.compute.kernel.arithmetic);
     return text;
 }

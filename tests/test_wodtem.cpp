@@ -923,12 +923,18 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
 
     const std::string nowhere = "D4RL_DATASET_DIR=" + (scratch / "none") + " ";
-    if (!fs::exists(std::string(own_folder) + "/walker2d_medium-v2.hdf5"))
-        check_shell(nowhere + "./wodtem train walker2d-medium", 1, "--dataset FILE");
+    if (!fs::exists(std::string(own_folder) + "/walker2d_medium_replay-v2.hdf5"))
+        check_shell(nowhere + "./wodtem train walker2d-medium-replay", 1,
+                    "by: wodtem collect walker2d-medium-replay-v2");
     check_shell("./wodtem train hopper-medium --dataset " + (scratch / "none.hdf5"), 1, "none.hdf5");
     check_shell("./wodtem train maze2d-umaze --dataset README.md --out " + (scratch / "text"), 1, "README.md");
     check_shell("./wodtem collect hopper", 2, "nearest is");
-    check_shell("./wodtem collect antmaze-umaze --out " + (scratch / "x.hdf5"), 1, "cannot be made");
+    check_shell("./wodtem collect hopper-medium --policy data/policies/halfcheetah-medium.safetensors --out " +
+                    (scratch / "x.hdf5"),
+                1, "another task's");
+    check_shell("./wodtem collect hopper-medium --policy README.md --out " + (scratch / "x.hdf5"), 1, "README.md");
+    CHECK(!fs::exists(scratch / "x.hdf5") && !fs::exists(scratch / "x.hdf5.tmp"));
+    check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  20 minutes");
     check_shell("./wodtem collect maze2d-umaze --steps 0", 2, "nearest is 1");
 }
 
