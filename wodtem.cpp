@@ -1301,8 +1301,11 @@ void save_results(Run& run, const GridWorld& world, const RunFolder& folder) {
 std::vector<Trajectory> make_data_set(const Settings& settings, MujocoEnvironment environment) {
     const EnvironmentSpec spec = environment.spec();
     std::vector<Trajectory> trajectories;
-    if (settings.behaviour == "recorded")
-        trajectories = cut_trajectories(read_data_set(settings.dataset_path), *environment.task, settings.dataset_path);
+    if (settings.behaviour == "recorded") {
+        const Rows rows = read_data_set(settings.dataset_path);
+        trajectories = cut_trajectories(rows, *environment.task, settings.dataset_path);
+        require_sound(rows, settings.dataset_path);
+    }
     for (uint64_t number = 0;
          settings.behaviour == "random" && trajectories.size() < static_cast<size_t>(settings.data_trajectories);
          ++number)
