@@ -136,14 +136,7 @@ inline const Hdf5Dataset& table_of(const Hdf5File& file, const std::string& name
     return *found;
 }
 
-inline void check_finite_rows(const Hdf5File& file, const char* name, const std::vector<float>& values, size_t width) {
-    for (size_t i = 0; i < values.size(); ++i)
-        if (!std::isfinite(values[i]))
-            fail("dataset.not_finite", "%s: \"%s\", row %zu, column %zu is %g; only finite numbers can be learned from",
-                 file.path.c_str(), name, i / width, i % width, static_cast<double>(values[i]));
-}
-
-// Errors: dataset.shape, dataset.not_finite, those of hdf5.hpp.
+// Errors: dataset.shape, those of hdf5.hpp.
 inline Rows read_rows(const Hdf5File& file) {
     Rows rows;
     const Shape shape = table_of(file, "observations", {}, {}).shape;
@@ -160,9 +153,6 @@ inline Rows read_rows(const Hdf5File& file) {
     if (file.find("timeouts")) rows.timeouts = file.read_flags(table_of(file, "timeouts", rows.count, 1));
     if (file.find("next_observations"))
         rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim));
-    check_finite_rows(file, "observations", rows.observations, rows.state_dim);
-    check_finite_rows(file, "actions", rows.actions, rows.action_dim);
-    check_finite_rows(file, "rewards", rows.rewards, 1);
     return rows;
 }
 
@@ -197,20 +187,26 @@ inline Rows read_minari(const Hdf5File& file) {
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
-    check_finite_rows(file, "observations", rows.observations, rows.state_dim);
-    check_finite_rows(file, "actions", rows.actions, rows.action_dim);
-    check_finite_rows(file, "rewards", rows.rewards, 1);
     return rows;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // From rows to trajectories.
 
-inline void append_row(Trajectory& trajectory, const Rows& rows, size_t row) {
-    const float *state = rows.observation(row), *action = &rows.actions[row * rows.action_dim];
-    trajectory.states.insert(trajectory.states.end(), state, state + rows.state_dim);
-    trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
-    trajectory.rewards.push_back(rows.rewards[row]);
+// The rows `which`, in vectors without room to spare: a data set is large.
+inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& which, bool terminated) {
+    Trajectory trajectory;
+    trajectory.states.reserve(which.size() * rows.state_dim);
+    trajectory.actions.reserve(which.size() * rows.action_dim);
+    trajectory.rewards.reserve(which.size());
+    for (const size_t row : which) {
+        const float *state = rows.observation(row), *action = &rows.actions[row * rows.action_dim];
+        trajectory.states.insert(trajectory.states.end(), state, state + rows.state_dim);
+        trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
+        trajectory.rewards.push_back(rows.rewards[row]);
+    }
+    trajectory.terminated = terminated;
+    return trajectory;
 }
 
 // D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last one
@@ -218,15 +214,16 @@ inline void append_row(Trajectory& trajectory, const Rows& rows, size_t row) {
 // Where a file has no timeouts (the first versions), `limit` steps end one too. The gym sets of replay buffers also have
 // timeouts at the ends of collection blocks; they cut, as in D4RL. maze2d: terminals are all 0, and timeouts mark that a
 // navigation goal was reached; the body is not reset, and the next row starts where this one ended.
-inline std::vector<Trajectory> cut_at_flags(const Rows& rows, int limit) {
+inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
     std::vector<Trajectory> trajectories;
-    Trajectory trajectory;
+    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
     for (size_t row = 0; row < rows.count; ++row) {
-        append_row(trajectory, rows, row);
-        const bool terminal = rows.terminals[row] != 0;
-        if (!(terminal || (rows.timeouts.empty() ? trajectory.length() == limit : rows.timeouts[row] != 0))) continue;
-        trajectory.terminated = terminal;
-        trajectories.push_back(std::exchange(trajectory, {}));
+        open.push_back(row);
+        const bool terminal = rows.terminals[row] != 0,
+                   timeout = rows.timeouts.empty() ? open.size() == limit : rows.timeouts[row] != 0;
+        if (!terminal && !timeout) continue;
+        trajectories.push_back(trajectory_of(rows, open, terminal));
+        open.clear();
     }
     return trajectories;
 }
@@ -237,7 +234,7 @@ inline std::vector<Trajectory> cut_at_flags(const Rows& rows, int limit) {
 // trajectory of one step and return 1, as in ODT.
 inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
     std::vector<Trajectory> trajectories;
-    Trajectory trajectory;
+    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
     const auto is_tuple = [&](size_t row) {
         return row + 1 < rows.count && (rows.timeouts.empty() || rows.timeouts[row] == 0);
     };
@@ -247,7 +244,7 @@ inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
             row = next;
             continue;
         }
-        append_row(trajectory, rows, row);
+        open.push_back(row);
         while (next < rows.count && !is_tuple(next)) ++next;
         double jump = 0;
         for (size_t i = 0; next < rows.count && i < rows.state_dim; ++i) {
@@ -256,8 +253,8 @@ inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
         }
         const bool terminal = rows.terminals[row] != 0;
         if (terminal || next >= rows.count || jump > 1e-12) {  // 1e-6 in norm
-            trajectory.terminated = terminal;
-            trajectories.push_back(std::exchange(trajectory, {}));
+            trajectories.push_back(trajectory_of(rows, open, terminal));
+            open.clear();
         }
         row = next;
     }
@@ -271,17 +268,42 @@ inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTa
         fail("dataset.task",
              "%s: has %zu state and %zu action numbers a step; %s has %d and %d: is it of another task?", path.c_str(),
              rows.state_dim, rows.action_dim, task.name, task.state_dim, task.action_dim);
-    std::vector<Trajectory> trajectories =
-        task.rules == Rules::antmaze ? cut_tuples(rows) : cut_at_flags(rows, task.max_episode_steps);
+    std::vector<Trajectory> trajectories = task.rules == Rules::antmaze
+                                               ? cut_tuples(rows)
+                                               : cut_at_flags(rows, static_cast<size_t>(task.max_episode_steps));
     if (trajectories.empty())
         fail("dataset.empty", "%s: no step is marked as the end of a trajectory, so there is none", path.c_str());
     return trajectories;
 }
 
+// What a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding error.
+// Errors: dataset.not_finite, dataset.action with the row and the column.
+inline void require_sound(const Rows& rows, const std::string& path) {
+    const auto require = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
+        for (size_t i = 0; i < values.size(); ++i) {
+            if (std::fabs(values[i]) <= bound) continue;  // never so for NaN
+            const bool finite = std::isfinite(values[i]);
+            fail(finite ? "dataset.action" : "dataset.not_finite", "%s: \"%s\", row %zu, column %zu is %g; %s",
+                 path.c_str(), name, i / width, i % width, static_cast<double>(values[i]),
+                 finite ? "actions lie in [-1, 1]: is it of another task, or not scaled?"
+                        : "only finite numbers can be learned from");
+        }
+    };
+    constexpr float any = std::numeric_limits<float>::max();
+    require("observations", rows.observations, rows.state_dim, any);
+    require("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
+    require("rewards", rows.rewards, 1, any);
+}
+
+// By its name, so that a damaged file is told as such, or by its signature, which may stand behind a user's block.
 inline bool is_hdf5(const std::string& path) {
-    char first[8] = {};
-    std::ifstream(path, std::ios::binary).read(first, 8);
-    return std::string_view(first, 8) == "\211HDF\r\n\032\n";
+    const std::filesystem::path extension = std::filesystem::path(path).extension();
+    if (extension == ".hdf5" || extension == ".h5") return true;
+    std::ifstream file(path, std::ios::binary);
+    char first[8];
+    for (std::streamoff at = 0; file.seekg(at).read(first, 8); at = at == 0 ? 512 : 2 * at)
+        if (std::string_view(first, 8) == "\211HDF\r\n\032\n") return true;
+    return false;
 }
 
 inline Rows read_data_set(const std::string& path) {
@@ -312,9 +334,27 @@ struct DataSetStatistics {
     size_t left_out = 0;      // rows in no trajectory
     size_t dead_columns = 0;  // of the state: always the same number
     size_t repeated = 0;      // rows whose observation is that of the row before
+    size_t duplicates = 0;    // rows whose observation, action and reward are those of an earlier row, anywhere
+    size_t not_finite = 0;    // numbers, of any kind
     size_t jumps = 0;         // rows within a trajectory whose next observation is not the next row's
     bool has_next = false;
 };
+
+// Rows that are there already, found by 64-bit hashes of their bytes.
+inline size_t count_duplicates(const Rows& rows) {
+    std::vector<uint64_t> hashes(rows.count);
+    std::vector<float> row;
+    for (size_t i = 0; i < rows.count; ++i) {
+        const float *state = rows.observation(i), *action = &rows.actions[i * rows.action_dim];
+        row.assign(state, state + rows.state_dim);
+        row.insert(row.end(), action, action + rows.action_dim);
+        row.push_back(rows.rewards[i]);
+        hashes[i] =
+            std::hash<std::string_view>{}({reinterpret_cast<const char*>(row.data()), row.size() * sizeof(float)});
+    }
+    std::ranges::sort(hashes);
+    return static_cast<size_t>(std::ranges::unique(hashes).size());
+}
 
 inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Trajectory>& trajectories) {
     DataSetStatistics s;
@@ -336,6 +376,9 @@ inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Traje
             dead = rows.observations[row * width + column] == rows.observations[column];
         s.dead_columns += dead;
     }
+    for (const auto* values : {&rows.observations, &rows.actions, &rows.rewards, &rows.next_observations})
+        s.not_finite += static_cast<size_t>(std::ranges::count_if(*values, [](float x) { return !std::isfinite(x); }));
+    s.duplicates = count_duplicates(rows);
     s.has_next = !rows.next_observations.empty();
     for (size_t row = 0; row + 1 < rows.count; ++row) {
         const float *here = rows.observation(row), *next = rows.observation(row + 1);
@@ -354,8 +397,9 @@ inline std::string describe(const DataSetStatistics& s) {
     text += "lengths:      " + s.lengths.text() + "\nreturns:      " + s.returns.text() + "\n";
     std::snprintf(line, sizeof line,
                   "actions:      %.9g to %.9g\nstate columns that never change: %zu\n"
-                  "rows that repeat the observation before: %zu\n",
-                  s.actions.low, s.actions.high, s.dead_columns, s.repeated);
+                  "rows that repeat the observation before: %zu\n"
+                  "rows that are equal to an earlier one: %zu\nnumbers that are not finite: %zu\n",
+                  s.actions.low, s.actions.high, s.dead_columns, s.repeated, s.duplicates, s.not_finite);
     text += line;
     text += s.has_next ? "next observations that are not the next row's: " + std::to_string(s.jumps) + "\n"
                        : "no next observations: the next row's stand in\n";

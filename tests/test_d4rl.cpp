@@ -81,7 +81,48 @@ TEST(statistics_count_dead_columns_repetitions_and_jumps) {
     CHECK_EQUAL(s.dead_columns, size_t{1});
     CHECK_EQUAL(s.repeated, size_t{1});
     CHECK_EQUAL(s.jumps, size_t{1});
+    CHECK_EQUAL(s.duplicates, size_t{0});
+    CHECK_EQUAL(s.not_finite, size_t{0});
     CHECK_CLOSE(s.actions.low, 0.04, 1e-7);
+    rows.actions[3] = NAN;  // one number, and rows 0 and 2 are the same
+    rows.observations = {4, 0, 4, 0, 4, 0, 6, 0};
+    rows.actions[2] = rows.actions[0];
+    rows.rewards = {1, 2, 1, 1};
+    const DataSetStatistics damaged = statistics_of(rows, cut_at_flags(rows, 1000));
+    CHECK_EQUAL(damaged.duplicates, size_t{1});
+    CHECK_EQUAL(damaged.not_finite, size_t{1});
+}
+
+TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
+    const Rows sound = made({1, 2, 3}, {0, 0, 1}, {});
+    const auto said = [](const Rows& rows) {
+        try {
+            require_sound(rows, "f");
+        } catch (const Error& error) {
+            return error.id + " " + error.what();
+        }
+        return std::string();
+    };
+    CHECK_EQUAL(said(sound), "");
+    Rows rows = sound;
+    rows.observations[1] = NAN;
+    CHECK_EQUAL(
+        said(rows),
+        "dataset.not_finite f: \"observations\", row 1, column 0 is nan; only finite numbers can be learned from");
+    rows = sound;
+    rows.rewards[2] = -INFINITY;
+    CHECK_EQUAL(said(rows),
+                "dataset.not_finite f: \"rewards\", row 2, column 0 is -inf; only finite numbers can be learned from");
+    rows = sound;
+    rows.actions[0] = -1.000001f;  // by rounding
+    CHECK_EQUAL(said(rows), "");
+    rows.actions[0] = -1.001f;
+    CHECK_EQUAL(said(rows),
+                "dataset.action f: \"actions\", row 0, column 0 is -1.001; actions lie in [-1, 1]: is it of another "
+                "task, or not scaled?");
+    rows.actions[0] = NAN;
+    CHECK_EQUAL(said(rows),
+                "dataset.not_finite f: \"actions\", row 0, column 0 is nan; only finite numbers can be learned from");
 }
 
 TEST(rows_of_another_size_or_without_an_end_are_refused) {

@@ -211,6 +211,21 @@ TEST(the_small_preset_differs_in_width_alone) {
     CHECK(small.width < paper.width);
 }
 
+TEST(the_small_preset_has_one_network_and_as_many_updates_for_all_methods) {
+    for (const char* task : {"hopper-medium-v2", "walker2d-medium-replay-v2", "ant-medium-v2", "antmaze-umaze-v2",
+                             "maze2d-umaze-v1", "maze2d-large-v1"}) {
+        const Settings dt = default_settings(task, "dt", "small"), odt = default_settings(task, "odt", "small"),
+                       wodtem = default_settings(task, "wodtem", "small");
+        for (const char* name : {"layers", "heads", "width", "context_length", "position", "dropout", "batch_size",
+                                 "learning_rate", "warmup_updates", "reward_scale", "g_eval"})
+            CHECK_EQUAL(name + setting_text(dt, setting_row(name)), name + setting_text(odt, setting_row(name)));
+        const int64_t episodes = (odt.online_steps + 299) / 300;  // of 300 steps, as maze2d-umaze's
+        CHECK_EQUAL(dt.offline_updates, odt.offline_updates + episodes * odt.updates_per_iteration);
+        for (const SettingRow& row : setting_rows)
+            if (std::string(row.name) != "method") CHECK_EQUAL(setting_text(wodtem, row), setting_text(odt, row));
+    }
+}
+
 TEST(settings_survive_being_written_and_read) {
     Settings s = tiny_settings("wodtem");
     set_setting(s, "epsilon", "0.30000000000000004");
