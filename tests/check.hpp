@@ -1217,7 +1217,8 @@ struct Slack {
             for (size_t i = 0; i < n; ++i) {
                 const double divisor = std::sqrt(optimizer.second_moment[p][i] / bias2) + config.epsilon;
                 u[i] = optimizer.first_moment[p][i] / bias1 / divisor;
-                du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
+                if (optimizer.second_moment[p][i] != 0)  // an exact 0 is no rounding: nothing leads there
+                    du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
                 if (lamb) u[i] += config.weight_decay * before[p][i];
                 squares_of_value += static_cast<double>(before[p][i]) * before[p][i];
                 squares_of_u += u[i] * u[i];
