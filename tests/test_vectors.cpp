@@ -1,4 +1,4 @@
-// test_vectors.cpp: the golden vectors hold, a wrong expected value does not, and what is no file of vectors is refused.
+// test_vectors.cpp: golden vectors hold, a wrong expected value does not, and what is no file of vectors is refused.
 #include <dirent.h>
 #include <fcntl.h>
 #include <unistd.h>
@@ -136,7 +136,7 @@ std::vector<std::string> case_names(const TensorFile& file) {
     return names;
 }
 
-// Moves one entry by a hundredth of the tensor's largest (a little more: env's are compared to 1e-9), a whole number by 1.
+// Moves one entry by a hundredth of the tensor's largest and a bit, a whole number by 1.
 template <class T>
 void perturb(char* bytes, size_t count, size_t at) {
     std::vector<T> values(count);
