@@ -4,8 +4,8 @@
 // In order: cases (inputs by name, outputs held against what the file expects, each within its stated tolerance); one
 // function for each topic, in porting order; the table of topics; files.
 // Promises: files are untrusted: what is missing, unknown, of another shape or not counted is a sentence with file,
-// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a case
-// is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
+// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a
+// case is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
 #pragma once
 
 namespace vectors {
@@ -249,8 +249,8 @@ struct Case {
         }
     }
 
-    // Holds `got` against CASE/out/NAME. `optional`: the file may leave it out. `leading`: a list
-    // of which the file may have more or less, and the first entries are held. `slack`: how much more than the tolerance each entry may be off.
+    // Holds `got` against CASE/out/NAME. `optional`: the file may leave it out. `leading`: a list of which the file may
+    // have more or less, and the first entries are held. `slack`: how much more than the tolerance each may be off.
     template <class T>
     void expect(const std::string& output, const Shape& shape, std::vector<T> got, bool optional = false,
                 bool leading = false, const std::vector<double>& slack = {}) {
@@ -772,8 +772,8 @@ void check_policy_deterministic(Case& c) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Topics: the memory
 
-// The table after (states [n, S], actions [n, A], e [n]) in this order, by eq. (4). Settings: capacity, K, epsilon, tau,
-// eviction, exclude_self; projection [F1, S].
+// The table after (states [n, S], actions [n, A], e [n]) in this order, by eq. (4). Settings: capacity, K, epsilon,
+// tau, eviction, exclude_self; projection [F1, S].
 struct Table {
     Array<float> states, actions;
     Array<double> e;
@@ -1216,7 +1216,8 @@ struct Slack {
             for (size_t i = 0; i < n; ++i) {
                 const double divisor = std::sqrt(optimizer.second_moment[p][i] / bias2) + config.epsilon;
                 u[i] = optimizer.first_moment[p][i] / bias1 / divisor;
-                du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
+                if (optimizer.second_moment[p][i] != 0)  // an exact 0 is no rounding: nothing leads there
+                    du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
                 if (lamb) u[i] += config.weight_decay * before[p][i];
                 squares_of_value += static_cast<double>(before[p][i]) * before[p][i];
                 squares_of_u += u[i] * u[i];

@@ -489,6 +489,24 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
     CHECK(chi_square < 29.9);  // 7 degrees of freedom: exceeded once in 10,000 seeds
 }
 
+// WODTEM sec. III-B, g_{t+1} test: with rewards on the way, of which the grid world has none.
+TEST(the_return_to_go_falls_by_each_reward) {
+    struct Paying {
+        Step step(const float* action, float* state) {
+            state[0] += *action;
+            return {2.5, state[0] > 2};
+        }
+    } environment;
+    Episode episode;
+    episode.state = {0};
+    episode.returns_to_go = {5};
+    for (int t = 0; t < 3; ++t) step_episode(episode, environment, {1}, 0.5);
+    CHECK(episode.returns_to_go == std::vector<float>({5, 3.75f, 2.5f, 1.25f}));
+    CHECK(episode.trajectory.states == std::vector<float>({0, 1, 2}));  // before each step
+    CHECK(episode.trajectory.rewards == std::vector<float>({2.5f, 2.5f, 2.5f}));
+    CHECK(episode.over && episode.trajectory.terminated && episode.state[0] == 3);
+}
+
 // WODTEM sec. III-B, g_{t+1} test: the agent is told the target less what it received; the buffer gets hindsight returns.
 TEST(acting_is_told_the_target_less_the_rewards_so_far) {
     Settings settings = tiny_settings("odt");
