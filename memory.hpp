@@ -142,8 +142,8 @@ struct ReplayBuffer {
             ends.push_back((ends.empty() ? 0 : ends.back()) + static_cast<uint64_t>(trajectory.length()));
     }
 
-    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory with probability proportional to its length, a
-    // start uniform over its steps, then the next min(context_length, what is left) steps: windows near the end are
+    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory with probability proportional to its length,
+    // a start uniform over its steps, then the next min(context_length, what is left) steps: windows near the end are
     // short.
     // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
     // One draw over all steps laid end to end
@@ -780,8 +780,8 @@ struct EpisodicMemory {
                  "got %d, %d, %d, %zu, %d, %g, %g",
                  config.state_dim, config.action_dim, config.K, config.capacity, config.projected_dim, config.epsilon,
                  config.tau);
-        // WODTEM sec. IV-B.1, projection: random, from R^F to R^F1. Variance 1 / F1 keeps the expected squared distance,
-        // so that epsilon means the same before and after.
+        // WODTEM sec. IV-B.1, projection: random, from R^F to R^F1. Variance 1 / F1 keeps the expected squared
+        // distance, so that epsilon means the same before and after.
         const Random random{seed, Stream::projection};
         const double scale = 1.0 / std::sqrt(static_cast<double>(dim));
         projection.resize(static_cast<size_t>(config.projected_dim) * S);

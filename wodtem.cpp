@@ -740,9 +740,9 @@ void remember(Run& run, Trajectory trajectory) {
     run.progress.evicted += static_cast<double>(changes.evicted);
 }
 
-// WODTEM sec. IV-B.3, step 2: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each
-// batch. Without a neighbour there is nothing against a_c: w = 1. Only reads the table: parts of a batch look up side
-// by side.
+// WODTEM sec. IV-B.3, step 2: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in
+// each batch. Without a neighbour there is nothing against a_c: w = 1. Only reads the table: parts of a batch look up
+// side by side.
 void consult_memory(const Run& run, Batch& batch) {
     if (!run.remembers()) return;
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
@@ -1730,7 +1730,8 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
     p.rollout_length = p.rollout_return = p.rollouts = p.matched = p.evicted = p.dropped = 0;
 }
 
-// WODTEM sec. IV-B.3, step 4: offline training (fig. 2) on D_offline. The table has taken in every trajectory of it before.
+// WODTEM sec. IV-B.3, step 4: offline training (fig. 2) on D_offline. The table has taken in every trajectory of it
+// before.
 template <class Environment>
 void offline_phase(Run& run, Session<Environment>& session) {
     const uint64_t updates = static_cast<uint64_t>(run.agent.settings.offline_updates);

@@ -1,5 +1,6 @@
-// dump.hpp: `wodtem check --dump FILE --run DIR`: every intermediate tensor of one update of a run, by name, laid out as a
-// case of topic `step`, so that `wodtem check` judges it, and a port that drifts can be bisected. Included by wodtem.cpp.
+// dump.hpp: `wodtem check --dump FILE --run DIR`: every intermediate tensor of one update of a run, by name, laid out
+// as a case of topic `step`, so that `wodtem check` judges it, and a port that drifts can be bisected. Included by
+// wodtem.cpp.
 //
 // The update is the next one of a run that has a checkpoint, else the first. Dropout is off, and the batch is one part:
 // where the run's own update is in parts, sums are added in another order.

@@ -507,7 +507,8 @@ TEST(the_return_to_go_falls_by_each_reward) {
     CHECK(episode.over && episode.trajectory.terminated && episode.state[0] == 3);
 }
 
-// WODTEM sec. III-B, g_{t+1} test: the agent is told the target less what it received; the buffer gets hindsight returns.
+// WODTEM sec. III-B, g_{t+1} test: the agent is told the target less what it received; the buffer gets hindsight
+// returns.
 TEST(acting_is_told_the_target_less_the_rewards_so_far) {
     Settings settings = tiny_settings("odt");
     set_setting(settings, "context_length", "2");
