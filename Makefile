@@ -6,6 +6,8 @@
 #   make                  build ./wodtem alone
 #   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
+#   make map              the map from the paper's equations to code, tests and vectors, as README.md holds it
+#   make mutants          which of some 160 one-line mistakes the golden vectors and the tests find; about 15 minutes
 #   make bench            the machine's peak, each kernel's share of it, update and look-up times
 #   make format           lay out the sources with clang-format
 #   make clean            remove what was built (runs/ stays)
@@ -69,6 +71,14 @@ sanitize: wodtem build/tests-sanitized build/tests-threads
 	build/tests-threads threads number_of_threads
 	build/tests-sanitized
 
+map:
+	@mkdir -p build
+	@$(CXX) -std=c++20 -O1 -DPRINT_MAP tests/test_map.cpp -o build/map
+	@build/map
+
+mutants: | packages
+	@sh tests/mutants.sh
+
 bench: wodtem
 	./wodtem bench
 
@@ -78,4 +88,4 @@ format:
 clean:
 	rm -rf build wodtem
 
-.PHONY: packages run paper-gridworld test sanitize bench format clean
+.PHONY: packages run paper-gridworld test sanitize map mutants bench format clean

@@ -138,10 +138,11 @@ struct GridWorld {
 // ---------------------------------------------------------------------------------------------------------------------
 // The behaviour policy and the offline data set.
 
-// WODTEM sec. IV-A: 20% to each of two moves, 10% to each of the six others.
+// WODTEM sec. IV-A: the behaviour policy: 20% to each of two moves, 10% to each of the six others.
+// departs from the paper: not "left" and "down", which its own statistics rule out, see chain_statistics().
 enum class Behaviour {
-    right_down,  // departs from WODTEM sec. IV-A ("left" and "down"): see chain_statistics() for the reason
-    left_down,   // the paper's words
+    right_down,
+    left_down,  // the paper's words
 };
 constexpr std::array<const char*, 2> behaviour_names{"right_down", "left_down"};
 
@@ -189,11 +190,11 @@ inline Trajectory collect_trajectory(GridWorld world, Behaviour behaviour, uint3
     return trajectory;
 }
 
-// WODTEM sec. IV-A: mean length 47.50, mean return 0.91. The first seed from 0 upwards whose 500 trajectories under
+// Sec. IV-A: mean length 47.50, mean return 0.91. The first seed from 0 upwards whose 500 trajectories under
 // right_down and clipped have exactly these means: 23750 steps, 455 arrivals. (A typical seed: 49.8 and 0.88.)
 constexpr uint32_t default_data_seed = 138129;
 
-// WODTEM sec. IV-A: 500 trajectories.
+// Sec. IV-A: 500 trajectories.
 inline std::vector<Trajectory> collect_data_set(const GridWorld& world, Behaviour behaviour, uint32_t seed,
                                                 int trajectories = 500) {
     std::vector<Trajectory> data_set;

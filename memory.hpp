@@ -41,7 +41,7 @@ struct Trajectory {
     int length() const { return static_cast<int>(rewards.size()); }
 };
 
-// WODTEM sec. III-A: d_t = sum_{t'=t..T} gamma^(t'-t) r_t', backwards as d_t = r_t + gamma d_{t+1}, d_{T+1} = 0.
+// WODTEM sec. III-A, d_t: d_t = sum_{t'=t..T} gamma^(t'-t) r_t', backwards as d_t = r_t + gamma d_{t+1}, d_{T+1} = 0.
 // A plain sum to the last step, also when the time limit cut the trajectory: nothing is bootstrapped.
 inline std::vector<double> discounted_returns(const std::vector<float>& rewards, double gamma) {
     std::vector<double> d(rewards.size());
@@ -50,8 +50,8 @@ inline std::vector<double> discounted_returns(const std::vector<float>& rewards,
     return d;
 }
 
-// WODTEM sec. III-A: g_t = sum_{t'=t..T} r_t', which is d_t with gamma = 1.
-// departs from ODT's code: summed in double, not in float32.
+// WODTEM sec. III-A, g_t: g_t = sum_{t'=t..T} r_t', which is d_t with gamma = 1.
+// departs from ODT's code: summed in double, not in float32, so that the order of additions hardly matters.
 inline std::vector<double> returns_to_go(const std::vector<float>& rewards) { return discounted_returns(rewards, 1.0); }
 
 template <class Number>
@@ -124,7 +124,8 @@ struct ReplayBuffer {
         count_steps();
     }
 
-    // WODTEM sec. III-A: first in, first out: append until full, then overwrite from index 0 upwards, lap after lap.
+    // WODTEM sec. III-A, D_online: first in, first out: append until full, then overwrite from index 0 upwards, lap
+    // after lap.
     void add(Trajectory trajectory) {
         if (trajectories.size() < capacity) {
             trajectories.push_back(std::move(trajectory));
@@ -141,8 +142,11 @@ struct ReplayBuffer {
             ends.push_back((ends.empty() ? 0 : ends.back()) + static_cast<uint64_t>(trajectory.length()));
     }
 
-    // A trajectory with probability proportional to its length, a start uniform over its steps, then the next
-    // min(context_length, what is left) steps: windows near the end are short. One draw over all steps laid end to end
+    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory with probability proportional to its length,
+    // a start uniform over its steps, then the next min(context_length, what is left) steps: windows near the end are
+    // short.
+    // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
+    // One draw over all steps laid end to end
     // gives both exactly: a trajectory owns `length` of the `total` numbers, each of them one start.
     Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length) const {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
@@ -221,6 +225,7 @@ struct Neighbour {
     uint32_t entry;
 };
 
+// WODTEM sec. IV-B.2, q: q(s_q, s_k) = ||s_q - s_k||^2, not its root.
 inline float squared_distance(const float* a, const float* b, size_t dim) {
     float sum = 0.0f;
     for (size_t d = 0; d < dim; ++d) sum += (a[d] - b[d]) * (a[d] - b[d]);
@@ -775,8 +780,8 @@ struct EpisodicMemory {
                  "got %d, %d, %d, %zu, %d, %g, %g",
                  config.state_dim, config.action_dim, config.K, config.capacity, config.projected_dim, config.epsilon,
                  config.tau);
-        // WODTEM sec. IV-B.1: random projection from R^F to R^F1. Variance 1 / F1 keeps the expected squared distance,
-        // so that epsilon means the same before and after.
+        // WODTEM sec. IV-B.1, projection: random, from R^F to R^F1. Variance 1 / F1 keeps the expected squared
+        // distance, so that epsilon means the same before and after.
         const Random random{seed, Stream::projection};
         const double scale = 1.0 / std::sqrt(static_cast<double>(dim));
         projection.resize(static_cast<size_t>(config.projected_dim) * S);
@@ -872,7 +877,8 @@ struct EpisodicMemory {
         return a.priority > b.priority || (a.priority == b.priority && a.age > b.age);
     }
 
-    // WODTEM sec. IV-B.1: "When Q is filled, we remove the least frequently accessed entry"; ties: the oldest.
+    // WODTEM sec. IV-B.1, full table: "When Q is filled, we remove the least frequently accessed entry"; ties: the
+    // oldest.
     // Accesses do not touch the heap: an item holds the priority its entry had when it was pushed, which is at most
     // what it has now. So when the smallest item proves up to date, no entry can be below it; when it does not, it goes
     // back with its present priority. Each access makes at most one item stale: amortised, one push per access.
@@ -935,7 +941,7 @@ struct EpisodicMemory {
         for (size_t d = 0; d < dim; ++d) point[d] += 0.0f;  // -0 becomes +0
     }
 
-    // WODTEM sec. IV-B.2: K(s_q) = {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for a
+    // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for a
     // projected s_q; `skipped` is passed over. Specification:
     std::vector<Neighbour> nearest_plain(const float* point, uint32_t skipped) const {
         std::vector<Neighbour> found;

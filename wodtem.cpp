@@ -39,7 +39,7 @@
 
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
-    std::string physics = "none", mujoco = "none", dataset = "none", dataset_sha256 = "none";
+    std::string physics = "none", mujoco = "none", dataset = "none", dataset_sha256 = "none", first_weights = "none";
     int64_t seed = 0;
 
     int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
@@ -66,7 +66,7 @@ struct Settings {
     int64_t data_trajectories = 500, data_seed = default_data_seed;
 
     std::map<std::string, std::string> source;  // of values that do not come from the table: name -> where from
-    std::string dataset_path;  // where the data set is on this machine; not a setting: a run may go on elsewhere
+    std::string dataset_path, weights_path;  // where they are on this machine; no settings: a run may go on elsewhere
 };
 
 using Field = std::variant<bool Settings::*, int64_t Settings::*, double Settings::*, std::string Settings::*>;
@@ -85,6 +85,7 @@ constexpr const char* task_names =
     "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|walker2d-v2|halfcheetah-v2|"
     "ant-v2";
 constexpr double many = 1e9;
+// WODTEM Table I: each row is the source of a value below.
 inline const SettingRow setting_rows[] = {
     {"task", &Settings::task, 0, 0, task_names, "command line"},
     {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
@@ -96,6 +97,7 @@ inline const SettingRow setting_rows[] = {
     {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
     {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
     {"dataset_sha256", &Settings::dataset_sha256, 0, 0, "", "of the file"},
+    {"first_weights", &Settings::first_weights, 0, 0, "", "none: drawn from the seed"},
     // The network.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
@@ -156,6 +158,7 @@ inline const SettingRow setting_rows[] = {
 struct TaskRow {
     const char *task, *method, *name, *value, *source;
 };
+// WODTEM Table II: each row likewise.
 inline const TaskRow task_rows[] = {
     {"", "", "layers", "4", "ODT's code"},
     {"", "", "heads", "4", "ODT's code"},
@@ -209,23 +212,23 @@ inline const TaskRow task_rows[] = {
     {"antmaze", "", "g_eval", "1", "one public reproduction of ODT"},
     {"antmaze", "", "g_online", "2", "one public reproduction of ODT"},
     {"antmaze", "", "reward_scale", "1", "ODT's code"},
-    {"maze2d", "", "layers", "4", "WODTEM Table II"},
-    {"maze2d", "", "heads", "4", "WODTEM Table II"},
-    {"maze2d", "", "width", "512", "WODTEM Table II"},
-    {"maze2d", "", "context_length", "20", "WODTEM Table II"},
-    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II"},
-    {"maze2d", "", "weight_decay", "0", "WODTEM Table II"},
-    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II"},
-    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II"},
-    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II"},
-    {"maze2d", "", "position", "yes", "WODTEM Table II"},
+    {"maze2d", "", "layers", "4", "WODTEM Table II: number of layers"},
+    {"maze2d", "", "heads", "4", "WODTEM Table II: number of attention heads"},
+    {"maze2d", "", "width", "512", "WODTEM Table II: embedding dimension"},
+    {"maze2d", "", "context_length", "20", "WODTEM Table II: context length"},
+    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II: learning rate"},
+    {"maze2d", "", "weight_decay", "0", "WODTEM Table II: weight decay"},
+    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II: offline training updates"},
+    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II: online training updates per iteration"},
+    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II: buffer size"},
+    {"maze2d", "", "position", "yes", "WODTEM Table II: position"},
     {"maze2d", "", "eta", "-2", "ODT's code: minus the action dimensions"},
-    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II"},
-    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II"},
-    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II"},
-    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II"},
-    {"maze2d-large", "", "g_online", "560", "WODTEM Table II"},
-    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II"},
+    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II: g_online"},
+    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II: g_eval"},
+    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II: g_online"},
+    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II: g_eval"},
+    {"maze2d-large", "", "g_online", "560", "WODTEM Table II: g_online"},
+    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II: g_eval"},
     {"maze2d-large", "", "table_size", "4e6", "WODTEM sec. V-C"},
     {"", "dt", "layers", "3", "DT's code"},
     {"", "dt", "heads", "1", "DT's code"},
@@ -671,7 +674,8 @@ void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const fl
     for (int i = 0; i < spec.action_dim; ++i) to.push_back(spec.moves > 0 ? action[i] : clamp_action(action[i]));
 }
 
-// One update's data, or a part of it: n steps of some of the batch_size windows, packed.
+// One update's data, or a part of it: n steps of some of the batch_size windows.
+// departs from ODT's code: packed, not padded on the left to context_length, so that no mask is needed.
 struct Batch {
     SequenceBatch sequences;
     std::vector<float> actions;              // [n, action_dim] a_c
@@ -684,8 +688,7 @@ struct Batch {
     Neighbourhoods neighbours;               // [n] K(s_c)
 };
 
-// WODTEM sec. III-B: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}), with d for eq. (9); C^t: the steps of a window.
-// departs from the paper: a window is the next C steps from a uniform start (ODT's code), not the latest C up to t.
+// WODTEM sec. IV-B.3, step 1: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}, d_{-C,t}) from the replay buffer.
 Batch sample_batch(const Run& run, uint32_t first_window, uint32_t end_window) {
     const Settings& settings = run.agent.settings;
     const EnvironmentSpec& spec = run.agent.spec;
@@ -725,7 +728,7 @@ void append_memory_key(std::vector<float>& to, const Agent& agent, const float* 
         to.insert(to.end(), state, state + agent.spec.state_dim);
 }
 
-// WODTEM sec. IV-B.1, eq. (4): the table takes in a trajectory, once, as soon as it is there.
+// Sec. IV-B.1, by eq. (4): the table takes in a trajectory, once, as soon as it is there.
 void remember(Run& run, Trajectory trajectory) {
     if (!run.remembers()) return;
     std::vector<float> keys;
@@ -737,9 +740,9 @@ void remember(Run& run, Trajectory trajectory) {
     run.progress.evicted += static_cast<double>(changes.evicted);
 }
 
-// WODTEM sec. IV-B.3: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in each
-// batch. Without a neighbour there is nothing against a_c: w = 1. Only reads the table: parts of a batch look up side
-// by side.
+// WODTEM sec. IV-B.3, step 2: look up s_c in Q; weight (s_c, a_c) by eq. (7) and draw a-hat(s_c) by eq. (6), anew in
+// each batch. Without a neighbour there is nothing against a_c: w = 1. Only reads the table: parts of a batch look up
+// side by side.
 void consult_memory(const Run& run, Batch& batch) {
     if (!run.remembers()) return;
     const size_t action_dim = static_cast<size_t>(run.agent.spec.action_dim);
@@ -813,7 +816,7 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     Objective<T> result;
     // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
     // WODTEM eq. (2): J is L with w = 1. Both terms read one distribution; the action tokens stay the buffer's.
-    // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; ODT's over all steps.
+    // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; not over all steps.
     result.L =
         combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()),
                 T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
@@ -821,10 +824,10 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
         result.lagrangian = result.L;
         return result;
     }
-    // WODTEM eq. (3), WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
-    // departs from ODT's code: over real steps only; ODT's code lets padding into this mean.
+    // WODTEM eq. (3); WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
+    // departs from ODT's code: over real steps only, as written; there padding enters this mean.
     result.H = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), mean.data());
-    // WODTEM eq. (1), WODTEM eq. (8): theta descends L + lambda (eta - H-bar); lambda eta does not depend on theta.
+    // WODTEM eq. (1); WODTEM eq. (8): L + lambda (eta - H-bar), which theta descends: lambda eta does not depend on it.
     result.lagrangian = combine(tape, T(1), result.L, -lambda, result.H);
     return result;
 }
@@ -840,7 +843,8 @@ Objective<T> learn(Tape<T>& tape, const Transformer<T>& model, const Batch& batc
     return result;
 }
 
-// WODTEM eq. (1), WODTEM eq. (8): lambda ascends lambda (eta - H-bar); by log lambda, whose gradient is the same number.
+// The other turn of eq. (1), eq. (8): lambda ascends lambda (eta - H-bar), by log lambda, so lambda >= 0. The gradient
+// of log lambda is lambda (eta - H-bar) itself.
 void update_lambda(Compute& compute, Temperature& temperature, const Settings& settings, double entropy) {
     OptimizerConfig config;
     config.rule = OptimizerConfig::Rule::adamw;
@@ -858,6 +862,16 @@ struct Part {
     std::exception_ptr problem;
 };
 
+// Standard normals for the entropy of the Gaussian head, [n, action_dim]; none for another head.
+std::vector<float> entropy_noise(const Run& run, const Batch& batch) {
+    std::vector<float> noise;
+    const size_t dim = static_cast<size_t>(run.agent.spec.action_dim);
+    const Random random = run.random(Stream::entropy_noise);
+    for (size_t i = 0; run.agent.model.config.head == Head::squashed_gaussian && i < batch.actions.size(); ++i)
+        noise.push_back(random.normal(run.progress.updates, batch.numbers[i / dim], static_cast<uint32_t>(i % dim)));
+    return noise;
+}
+
 void learn_part(Run& run, Part& part, uint32_t number) {
     const uint32_t parts = static_cast<uint32_t>(run.parts.count),
                    windows = static_cast<uint32_t>(run.agent.settings.batch_size);
@@ -871,20 +885,15 @@ void learn_part(Run& run, Part& part, uint32_t number) {
     part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
     consult_memory(run, part.batch);
 
-    const bool gaussian = run.agent.model.config.head == Head::squashed_gaussian;
-    std::vector<float> noise;
-    for (size_t i = 0; gaussian && i < part.batch.actions.size(); ++i) {
-        const size_t dim = static_cast<size_t>(run.agent.spec.action_dim);
-        noise.push_back(run.random(Stream::entropy_noise)
-                            .normal(run.progress.updates, part.batch.numbers[i / dim], static_cast<uint32_t>(i % dim)));
-    }
+    const std::vector<float> noise = entropy_noise(run, part.batch);
     const Objective<float> result =
         learn(tape, run.agent.model, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
     part.loss = result.L.value[0];
     if (run.constrains_entropy()) part.entropy = result.H.value[0];
 }
 
-// One alternation of eq. (8) on one batch: a step of theta, then one of lambda with the entropy of the same pass.
+// WODTEM sec. IV-B.3, step 3: "alternately optimizing" eq. (8), on one batch: a step of theta, then one of lambda with
+// the entropy of the same pass.
 void update(Run& run) {
     std::vector<Part> parts(run.parts.count);
     const auto learn = [&](int number, int) {
@@ -919,7 +928,7 @@ void update(Run& run) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Acting. WODTEM sec. III-B.
+// Acting, sec. III-B.
 
 enum class Act { sample, most_likely };  // online interaction; evaluation
 
@@ -1000,6 +1009,7 @@ void step_episode(Episode& episode, Environment& environment, const std::vector<
         const Step step = environment.step(action.data(), episode.state.data());
         trajectory.rewards.push_back(static_cast<float>(step.reward));
         trajectory.terminated = episode.over = step.terminated;
+        // WODTEM sec. III-B, g_{t+1}: g_{t+1} = g_t - r_t
         episode.returns_to_go.push_back(episode.returns_to_go.back() - static_cast<float>(step.reward * reward_scale));
     } catch (const Error& error) {
         if (error.id != "mujoco.unstable") throw;
@@ -1011,7 +1021,7 @@ void step_episode(Episode& episode, Environment& environment, const std::vector<
 
 // Plays `count` episodes numbered from `first_episode` side by side, through the network as one batch; environments
 // step on the threads there are. `environments`: at least as many, in whatever state.
-// WODTEM sec. III-B: g_1 = target; a_t from the policy (sampled, or the most likely one); g_{t+1} = g_t - r_t.
+// Sec. III-B: g_1 = target; a_t from the policy: sampled, or the most likely one.
 template <class Environment>
 std::vector<Episode> rollout(Run& run, std::vector<Environment>& environments, Act act, double target,
                              uint64_t first_episode, int count) {
@@ -1065,7 +1075,7 @@ struct Evaluation {
     std::vector<Episode> episodes;
 };
 
-// WODTEM sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. `number`: of the evaluation.
+// Sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. `number`: of the evaluation.
 template <class Environment>
 Evaluation evaluate(Run& run, std::vector<Environment>& environments, uint64_t number, int count) {
     Evaluation result;
@@ -1141,8 +1151,7 @@ void save_checkpoint(Run& run, const RunFolder& folder) {
 }
 
 // Errors name the file: a checkpoint may be damaged, or belong to another program's idea of a run.
-void load_checkpoint(Run& run, const RunFolder& folder) {
-    const std::string path = folder.file("checkpoint.safetensors");
+void load_state(Run& run, const std::string& path) {
     try {
         const TensorFile file = read_safetensors(path);
         if (file.text("format") != "wodtem checkpoint 1")
@@ -1153,6 +1162,11 @@ void load_checkpoint(Run& run, const RunFolder& folder) {
     } catch (const Error& error) {
         fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
     }
+}
+
+// The state, and the logs cut back to where they were at that moment.
+void load_checkpoint(Run& run, const RunFolder& folder) {
+    load_state(run, folder.file("checkpoint.safetensors"));
     struct Log {
         std::string path;
         uint64_t bytes, crc;
@@ -1197,20 +1211,198 @@ void save_model(const Run& run, const std::string& path) {
     write_safetensors(path, file);
 }
 
-void load_model(Run& run, const TensorFile& file) {
+// "a", "b" and 3 more; for messages.
+std::string some_names(const std::vector<std::string>& names) {
+    std::string text;
+    for (size_t i = 0; i < std::min<size_t>(names.size(), 8); ++i) text += (i > 0 ? ", " : "") + json_string(names[i]);
+    return text + (names.size() > 8 ? " and " + std::to_string(names.size() - 8) + " more" : "");
+}
+
+// The file has the network's tensors, and no others but those of `besides`, which it may have.
+// Errors: model.names names what is missing and what is unknown.
+void require_names(const TensorFile& file, const Run& run, const std::set<std::string>& besides) {
+    std::set<std::string> known = besides;
+    std::vector<std::string> missing, unknown;
+    for (const Parameter<float>& parameter : run.agent.model.parameters) {
+        known.insert(parameter.name);
+        if (!file.has(parameter.name)) missing.push_back(parameter.name);
+    }
+    for (const StoredTensor& tensor : file.tensors)
+        if (!known.contains(tensor.name)) unknown.push_back(tensor.name);
+    if (missing.empty() && unknown.empty()) return;
+    fail("model.names",
+         "%s: does not hold the network of its settings: %s%s%s%s; are layers, position and method right?",
+         file.path.c_str(), missing.empty() ? "" : "missing ", some_names(missing).c_str(),
+         unknown.empty() ? "" : (missing.empty() ? "unknown " : "; unknown "), some_names(unknown).c_str());
+}
+
+// Errors: model.value, and those of TensorFile::read_into.
+void load_weights(Run& run, const TensorFile& file) {
     for (Parameter<float>& parameter : run.agent.model.parameters)
         file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
-    const uint64_t S = static_cast<uint64_t>(run.agent.spec.state_dim);
-    run.agent.normaliser = {file.get<float>("state_mean", {S}), file.get<float>("state_std", {S})};
+}
+
+void check_model(const Run& run, const std::string& path) {
     const auto require = [&](bool holds, const std::string& name, const char* what) {
         if (!holds)
-            fail("model.value", "%s: tensor %s holds a number that is not %s", file.path.c_str(), name.c_str(), what);
+            fail("model.value", "%s: tensor %s holds a number that is not %s", path.c_str(), name.c_str(), what);
     };
     for (const Parameter<float>& parameter : run.agent.model.parameters)
         for (const float value : parameter.value) require(std::isfinite(value), parameter.name, "finite");
+    require(std::isfinite(run.temperature.lambda()), "log_temperature", "finite, nor is its exponential");
     for (const float value : run.agent.normaliser.mean) require(std::isfinite(value), "state_mean", "finite");
     for (const float value : run.agent.normaliser.deviation)
         require(std::isfinite(value) && value > 0, "state_std", "finite and positive");
+}
+
+// What save_model() wrote, but for its counts of updates and interactions.
+void load_model(Run& run, const TensorFile& file) {
+    const uint64_t S = static_cast<uint64_t>(run.agent.spec.state_dim);
+    require_names(file, run, {"log_temperature", "state_mean", "state_std"});
+    load_weights(run, file);
+    file.read_into(std::span(run.temperature.log_lambda[0].value), "log_temperature", {});
+    run.agent.normaliser = {file.get<float>("state_mean", {S}), file.get<float>("state_std", {S})};
+    check_model(run, file.path);
+}
+
+// `given`: a model file, or a run's folder.
+std::string model_path(const std::string& given) {
+    return fs::is_directory(given) ? given + "/model.safetensors" : given;
+}
+
+// Before anything is allocated by the settings of a file. Errors: model.settings.
+void require_room(const TensorFile& file, const Settings& settings) {
+    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
+    if (settings.width % settings.heads != 0 || static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
+        fail("model.settings", "%s: does not hold the %lld weights and more that its settings call for",
+             file.path.c_str(), static_cast<long long>(weights));
+}
+
+TensorFile open_model(const std::string& given) {
+    const std::string path = model_path(given);
+    TensorFile file = read_safetensors(path);
+    const auto format = file.metadata.find("format");
+    if (format == file.metadata.end() || format->second != "wodtem model 1")
+        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
+    require_room(file, settings_from_text(file.text("settings"), path));
+    return file;
+}
+
+// The network that a run begins with, its temperature and its normaliser, from a model of the same shape.
+void begin_from_model(Run& run, const TensorFile& file) {
+    const Settings theirs = settings_from_text(file.text("settings"), file.path);
+    for (const char* name : {"layers", "heads", "width", "position", "state_encoding"}) {
+        const SettingRow& row = setting_row(name);
+        if (setting_text(theirs, row) != setting_text(run.agent.settings, row))
+            fail("model.settings", "%s has %s = %s, the run %s; make them equal with --set", file.path.c_str(), name,
+                 setting_text(theirs, row).c_str(), setting_text(run.agent.settings, row).c_str());
+    }
+    load_model(run, file);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Weights to and from ODT's own code. Its state_dict holds, besides our tensors, some that it neither trains nor uses;
+// it has no place for the temperature (there a plain attribute), the normaliser and the settings: those go into the
+// metadata, numbers as decimal text that reads back exactly.
+
+struct UnusedTensor {
+    std::string name;
+    Shape shape;
+};
+
+// ODT's code: GPT-2's vocabulary of one word; max_ep_len 1000; causal masks for n_positions 1024; heads for state and
+// return, which no loss reads.
+std::vector<UnusedTensor> unused_odt_tensors(const TransformerConfig& config) {
+    const uint64_t d = static_cast<uint64_t>(config.width), S = static_cast<uint64_t>(config.state_dim);
+    std::vector<UnusedTensor> unused = {{"transformer.wte.weight", {1, d}}, {"embed_timestep.weight", {1000, d}},
+                                        {"predict_state.weight", {S, d}},   {"predict_state.bias", {S}},
+                                        {"predict_return.weight", {1, d}},  {"predict_return.bias", {1}}};
+    for (int layer = 0; layer < config.layers; ++layer) {
+        const std::string attention = "transformer.h." + std::to_string(layer) + ".attn.";
+        unused.push_back({attention + "bias", {1, 1, 1024, 1024}});
+        unused.push_back({attention + "masked_bias", {}});
+    }
+    return unused;
+}
+
+std::string numbers_text(const std::vector<float>& values) {
+    std::string text;
+    for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
+    return text;
+}
+
+// Everything that a strict load_state_dict of ODT's model asks for, and nothing else.
+TensorFile odt_file(const Run& run) {
+    TensorFile file;
+    file.metadata["format"] = "ODT state_dict";
+    file.metadata["settings"] = settings_text(run.agent.settings);
+    file.metadata["updates"] = std::to_string(run.progress.updates);
+    file.metadata["interactions"] = std::to_string(run.progress.interactions);
+    file.metadata["log_temperature"] = numbers_text(run.temperature.log_lambda[0].value);
+    file.metadata["state_mean"] = numbers_text(run.agent.normaliser.mean);
+    file.metadata["state_std"] = numbers_text(run.agent.normaliser.deviation);
+    for (const Parameter<float>& parameter : run.agent.model.parameters)
+        file.add(parameter.name, parameter.shape, parameter.value);
+    for (const UnusedTensor& unused : unused_odt_tensors(run.agent.model.config)) {
+        size_t size = 1;
+        for (const uint64_t extent : unused.shape) size *= extent;
+        if (unused.name.ends_with(".attn.bias")) {
+            std::vector<uint8_t> seen(size);  // [query, key]
+            for (size_t i = 0; i < size; ++i) seen[i] = i % 1024 <= i / 1024;
+            file.add(unused.name, unused.shape, seen);
+        } else {
+            file.add(unused.name, unused.shape,
+                     std::vector<float>(size, unused.name.ends_with(".masked_bias") ? -1e4f : 0.0f));
+        }
+    }
+    return file;
+}
+
+// A tensor, or else the metadata entry of its name: numbers separated by spaces; nothing if there is neither.
+// Errors: import.metadata.
+std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape, size_t size) {
+    if (file.has(name)) return file.get<float>(name, shape);
+    if (!file.metadata.contains(name)) return {};
+    std::vector<float> values;
+    for (const std::string& word : split(file.text(name), ' ')) {
+        float value = NAN;
+        const char* end = word.data() + word.size();
+        if (std::from_chars(word.data(), end, value).ptr != end) value = NAN;
+        values.push_back(value);
+    }
+    if (values.size() != size || !std::all_of(values.begin(), values.end(), [](float x) { return std::isfinite(x); }))
+        fail("import.metadata", "%s: metadata entry %s is not %zu finite number%s separated by spaces",
+             file.path.c_str(), name.c_str(), size, size == 1 ? "" : "s");
+    return values;
+}
+
+// The reverse, of a file from ODT's code or from odt_file(). Returns whether the file has a normaliser.
+bool load_odt(Run& run, const TensorFile& file) {
+    std::set<std::string> besides = {"log_temperature", "state_mean", "state_std"};
+    for (const UnusedTensor& unused : unused_odt_tensors(run.agent.model.config)) besides.insert(unused.name);
+    require_names(file, run, besides);
+    load_weights(run, file);
+    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {}, 1);
+    if (!log_temperature.empty()) run.temperature.log_lambda[0].value = log_temperature;
+    const size_t S = static_cast<size_t>(run.agent.spec.state_dim);
+    run.agent.normaliser = {tensor_or_text(file, "state_mean", {S}, S), tensor_or_text(file, "state_std", {S}, S)};
+    if (run.agent.normaliser.mean.empty() != run.agent.normaliser.deviation.empty())
+        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
+             file.path.c_str());
+    return !run.agent.normaliser.mean.empty();
+}
+
+// Updates and interactions, as save_model() notes them; 0 where the file says nothing.
+void load_counts(Run& run, const TensorFile& file) {
+    for (auto [name, count] : std::initializer_list<std::pair<const char*, uint64_t&>>{
+             {"updates", run.progress.updates}, {"interactions", run.progress.interactions}}) {
+        const auto found = file.metadata.find(name);
+        const std::optional<double> x = to_number(found == file.metadata.end() ? "0" : found->second);
+        if (!x || *x < 0 || *x > 1e15 || *x != std::floor(*x))
+            fail("import.metadata", "%s: metadata entry %s is \"%s\", not a number of %s", file.path.c_str(), name,
+                 found->second.substr(0, 80).c_str(), name);
+        count = static_cast<uint64_t>(*x);
+    }
 }
 
 std::string csv_line(const std::vector<std::string>& fields) {
@@ -1538,7 +1730,8 @@ void evaluate_and_record(Run& run, Session<Environment>& session) {
     p.rollout_length = p.rollout_return = p.rollouts = p.matched = p.evicted = p.dropped = 0;
 }
 
-// WODTEM sec. IV-B.3, Fig. 2: offline training on D_offline. The table has taken in every trajectory of it before.
+// WODTEM sec. IV-B.3, step 4: offline training (fig. 2) on D_offline. The table has taken in every trajectory of it
+// before.
 template <class Environment>
 void offline_phase(Run& run, Session<Environment>& session) {
     const uint64_t updates = static_cast<uint64_t>(run.agent.settings.offline_updates);
@@ -1549,7 +1742,7 @@ void offline_phase(Run& run, Session<Environment>& session) {
     evaluate_and_record(run, session);
 }
 
-// One episode of interaction. WODTEM sec. III-B: its RTGs are computed from its rewards (relabel, in rollout). It enters
+// One episode of interaction. Sec. III-B: its RTGs are computed from its rewards (relabel, in rollout). It enters
 // D_online first in, first out, and the table at once, before the updates that follow it.
 template <class Environment>
 void interact(Run& run, Session<Environment>& session) {
@@ -1574,7 +1767,7 @@ void interact(Run& run, Session<Environment>& session) {
     run.replay.add(std::move(episode));
 }
 
-// WODTEM sec. IV-B.3, Fig. 2: online fine-tuning on D_online, which begins as the best trajectories of D_offline.
+// WODTEM sec. IV-B.3, step 5: online fine-tuning (fig. 2) on D_online, first the best trajectories of D_offline.
 // Each iteration: one episode, then updates_per_iteration updates; every eval_every iterations an evaluation.
 template <class Environment>
 void online_phase(Run& run, Session<Environment>& session) {
@@ -1613,9 +1806,13 @@ void fill_replay(Run& run, std::vector<Trajectory> data_set) {
     run.replay.start(std::move(data_set));
 }
 
-// D_offline, its statistics, and the memory's first contents, in the order of the data set.
+// D_offline, its statistics, and the memory's first contents, in the order of the data set. A given model brings its own
+// statistics: its network has seen no others.
 void begin_run(Run& run, const std::vector<Trajectory>& data_set) {
-    run.agent.normaliser = fit_normaliser(data_set, run.agent.spec.state_dim);
+    if (run.agent.settings.weights_path.empty())
+        run.agent.normaliser = fit_normaliser(data_set, run.agent.spec.state_dim);
+    else
+        begin_from_model(run, open_model(run.agent.settings.weights_path));
     for (const Trajectory& trajectory : offline_set(data_set, run.agent.settings.keep_lowest))
         remember(run, trajectory);
     fill_replay(run, data_set);
@@ -1741,6 +1938,8 @@ const Option physics_option = {"--physics", "NAME", "",
                                "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"};
 const Option set_option = {"--set", "NAME=VALUE", "",
                            "any setting (see `wodtem info` of a run's model); may be repeated"};
+const Option dataset_option = {"--dataset", "FILE", "",
+                               "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"};
 const Option kernel_option = {"--kernel", "NAME", "auto",
                               "matrix kernel: amx, avx512, avx2, portable, or the best there is"};
 const Option precision_option = {"--precision", "NAME", "fp32",
@@ -1810,8 +2009,8 @@ const Kernel& asked_kernel(const Arguments& arguments, const Settings& settings)
     return choose_kernel(name, precision);
 }
 
-Settings asked_settings(const Arguments& arguments, int64_t seed) {
-    Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
+Settings asked_settings(const Arguments& arguments, const std::string& task, int64_t seed) {
+    Settings settings = default_settings(task, arguments["--method"], arguments["--preset"]);
     settings.seed = seed;
     if (settings.task != "gridworld") {
         settings.mujoco = mujoco_version();
@@ -1826,7 +2025,7 @@ Settings asked_settings(const Arguments& arguments, int64_t seed) {
         const std::string name = assignment.substr(0, equals);
         const std::string row = setting_row(name).name;
         for (const char* fixed :
-             {"task", "method", "preset", "seed", "arithmetic", "mujoco", "dataset", "dataset_sha256"})
+             {"task", "method", "preset", "seed", "arithmetic", "mujoco", "dataset", "dataset_sha256", "first_weights"})
             if (row == fixed) fail("usage.setting", "%s is not given by --set; see wodtem train --help", fixed);
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
@@ -1859,7 +2058,11 @@ void command_train(const Arguments& arguments) {
     for (const int64_t seed : seed_list(several                       ? arguments["--seeds"]
                                         : arguments["--seed"].empty() ? "0"
                                                                       : arguments["--seed"])) {
-        const Settings settings = asked_settings(arguments, seed);
+        Settings settings = asked_settings(arguments, arguments.words[0], seed);
+        if (!arguments["--weights"].empty()) {
+            settings.weights_path = model_path(arguments["--weights"]);
+            set_from(settings, "first_weights", sha256_of_file(settings.weights_path), "SHA-256 of the model file");
+        }
         std::string folder = arguments["--out"].empty() ? default_folder(settings) : arguments["--out"];
         if (several && !arguments["--out"].empty()) folder += "/seed-" + std::to_string(seed);
         std::string line;
@@ -1868,21 +2071,6 @@ void command_train(const Arguments& arguments) {
         std::fprintf(stderr, "%s:%s\n", folder.c_str(), line.c_str());
         train(settings, folder, {asked_kernel(arguments, settings), threads, static_cast<double>(checkpoint_every)});
     }
-}
-
-// `given`: a model file, or a run's folder.
-TensorFile open_model(const std::string& given) {
-    const std::string path = fs::is_directory(given) ? given + "/model.safetensors" : given;
-    TensorFile file = read_safetensors(path);
-    const auto format = file.metadata.find("format");
-    if (format == file.metadata.end() || format->second != "wodtem model 1")
-        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
-    const Settings settings = settings_from_text(file.text("settings"), path);
-    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
-    if (settings.width % settings.heads != 0 || static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
-        fail("model.settings", "%s: does not hold the %lld weights and more that its own settings call for",
-             path.c_str(), static_cast<long long>(weights));
-    return file;
 }
 
 template <class Environment>
@@ -1911,6 +2099,51 @@ void command_eval(const Arguments& arguments) {
     const Settings settings = settings_from_text(file.text("settings"), file.path);
     with_environment(settings,
                      [&](const auto& environment) { evaluate_model(environment, settings, file, arguments); });
+}
+
+void command_export(const Arguments& arguments) {
+    if (arguments["--odt"].empty()) fail("usage.option", "export knows one layout; ask for it with --odt");
+    const TensorFile model = open_model(arguments.words[0]);
+    const Settings settings = settings_from_text(model.text("settings"), model.path);
+    with_environment(settings, [&](const auto& environment) {
+        Compute compute(choose_kernel("auto"), 1);
+        Run run(compute, settings, environment.spec());
+        load_model(run, model);
+        load_counts(run, model);
+        const TensorFile file = odt_file(run);
+        write_safetensors(arguments.words[1], file);
+        std::printf(
+            "%s: %zu tensors for a strict load_state_dict of ODT's model%s\n", arguments.words[1].c_str(),
+            file.tensors.size(),
+            run.agent.spec.moves > 0 ? ", were there not predict_action.logits: ODT has no discrete actions" : "");
+    });
+}
+
+void command_import(const Arguments& arguments) {
+    const TensorFile file = read_safetensors(arguments.words[0]);
+    const bool own = arguments["--task"].empty();
+    if (own && !file.metadata.contains("settings"))
+        fail("usage.option", "%s does not tell its settings; give --task, and --method, --preset, --set as in train",
+             file.path.c_str());
+    const Settings settings =
+        own ? settings_from_text(file.text("settings"), file.path) : asked_settings(arguments, arguments["--task"], 0);
+    require_room(file, settings);
+    with_environment(settings, [&](const auto& environment) {
+        Compute compute(choose_kernel("auto"), 1);
+        Run run(compute, settings, environment.spec());
+        if (!load_odt(run, file)) {
+            if (settings.behaviour == "random")
+                fail("import.normaliser",
+                     "%s has no state_mean and state_std, and there is no data set to take them from; see --dataset",
+                     file.path.c_str());
+            run.agent.normaliser = fit_normaliser(make_data_set(settings, environment), run.agent.spec.state_dim);
+        }
+        load_counts(run, file);
+        check_model(run, file.path);
+        save_model(run, arguments.words[1]);
+        std::printf("%s: %s, %s, for wodtem eval and wodtem train --weights\n", arguments.words[1].c_str(),
+                    settings.task.c_str(), settings.method.c_str());
+    });
 }
 
 #ifdef WODTEM_MUJOCO
@@ -2270,7 +2503,8 @@ const std::vector<Command>& commands() {
           seeds_option,
           set_option,
           physics_option,
-          {"--dataset", "FILE", "", "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
+          dataset_option,
+          {"--weights", "MODEL", "", "begin with a model's network, temperature and normaliser, not with random ones"},
           {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
           kernel_option,
           precision_option,
@@ -2284,6 +2518,27 @@ const std::vector<Command>& commands() {
          "evaluate a saved model; needs nothing else",
          {{"--episodes", "N", "1", "episodes"}, kernel_option, precision_option, threads_option},
          command_eval},
+        {"export",
+         "MODEL OUT",
+         2,
+         2,
+         "write a model's weights for another program",
+         {{"--odt", nullptr, "", "for load_state_dict(strict=True) of ODT's own code: its names, its unused tensors"}},
+         command_export},
+        {"import",
+         "FILE OUT",
+         2,
+         2,
+         "make a model of weights under ODT's names, in a safetensors file",
+         {{"--task", "ID", "", "whose network it is; not needed if `wodtem export` made the file"},
+          method_option,
+          preset_option,
+          set_option,
+          physics_option,
+          dataset_option,
+          kernel_option,
+          precision_option},
+         command_import},
         {"collect",
          "ID",
          1,
@@ -2334,10 +2589,15 @@ const std::vector<Command>& commands() {
          command_bench},
         {"check",
          "FILE...",
-         1,
+         0,
          10000,
          "recompute golden vectors, ours or yours, and compare",
-         {{"-v", nullptr, "", "print inputs, expected and got"}, kernel_option, threads_option},
+         {{"-v", nullptr, "", "print inputs, expected and got"},
+          {"--dump", "FILE", "", "write every tensor of one update of a run instead, as a case of topic step"},
+          {"--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
+          dataset_option,
+          kernel_option,
+          threads_option},
          command_check},
         {"tasks",
          "[TASK]",

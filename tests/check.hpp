@@ -4,8 +4,8 @@
 // In order: cases (inputs by name, outputs held against what the file expects, each within its stated tolerance); one
 // function for each topic, in porting order; the table of topics; files.
 // Promises: files are untrusted: what is missing, unknown, of another shape or not counted is a sentence with file,
-// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a case
-// is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
+// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a
+// case is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
 #pragma once
 
 namespace vectors {
@@ -249,8 +249,8 @@ struct Case {
         }
     }
 
-    // Holds `got` against CASE/out/NAME. `optional`: the file may leave it out. `leading`: a list
-    // of which the file may have more or less, and the first entries are held. `slack`: how much more than the tolerance each entry may be off.
+    // Holds `got` against CASE/out/NAME. `optional`: the file may leave it out. `leading`: a list of which the file may
+    // have more or less, and the first entries are held. `slack`: how much more than the tolerance each may be off.
     template <class T>
     void expect(const std::string& output, const Shape& shape, std::vector<T> got, bool optional = false,
                 bool leading = false, const std::vector<double>& slack = {}) {
@@ -772,8 +772,8 @@ void check_policy_deterministic(Case& c) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Topics: the memory
 
-// The table after (states [n, S], actions [n, A], e [n]) in this order, by eq. (4). Settings: capacity, K, epsilon, tau,
-// eviction, exclude_self; projection [F1, S].
+// The table after (states [n, S], actions [n, A], e [n]) in this order, by eq. (4). Settings: capacity, K, epsilon,
+// tau, eviction, exclude_self; projection [F1, S].
 struct Table {
     Array<float> states, actions;
     Array<double> e;
@@ -1216,7 +1216,8 @@ struct Slack {
             for (size_t i = 0; i < n; ++i) {
                 const double divisor = std::sqrt(optimizer.second_moment[p][i] / bias2) + config.epsilon;
                 u[i] = optimizer.first_moment[p][i] / bias1 / divisor;
-                du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
+                if (optimizer.second_moment[p][i] != 0)  // an exact 0 is no rounding: nothing leads there
+                    du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
                 if (lamb) u[i] += config.weight_decay * before[p][i];
                 squares_of_value += static_cast<double>(before[p][i]) * before[p][i];
                 squares_of_u += u[i] * u[i];
@@ -1231,6 +1232,51 @@ struct Slack {
         }
     }
 };
+
+// Moments of an optimiser that has made updates before: first_moment/NAME, second_moment/NAME; left out: zeros.
+void read_moments(Case& c, const auto& parameters, Optimizer& optimizer) {
+    for (const auto& parameter : parameters)
+        for (auto [kind, moments] : std::initializer_list<std::pair<const char*, std::vector<std::vector<float>>&>>{
+                 {"first_moment/", optimizer.first_moment}, {"second_moment/", optimizer.second_moment}})
+            moments.push_back(c.in_or<float>(kind + parameter.name, parameter.shape, 0).values);
+}
+
+// What `wodtem check --dump` adds of the memory: of each step its neighbours, closest first: memory/count [n],
+// memory/distance [n, K], memory/e [n, K], memory/actions [n, K, A], memory/d [n], memory/uniform [n] -> memory/e_hat,
+// memory/w [n], memory/a_hat [n, A], NaN where d is optimal and none is drawn. Settings: alpha, tau.
+void check_advice(Case& c) {
+    if (c.named("in/memory/").empty()) return;
+    const auto distance = c.in<float>("memory/distance", {any, any});
+    const uint64_t n = distance.shape[0], K = distance.shape[1];
+    const auto count = c.whole_in("memory/count", {n}, 0, static_cast<int64_t>(K));
+    const auto e = c.in<double>("memory/e", {n, K}), d = c.in<double>("memory/d", {n}),
+               uniform = c.in<double>("memory/uniform", {n});
+    const auto actions = c.in<float>("memory/actions", {n, K, any});
+    const double alpha = c.number("alpha", {}, 0, 1);
+    MemoryConfig config{};
+    config.state_dim = config.K = 1;
+    config.capacity = 1;
+    config.action_dim = actions.back();
+    config.tau = c.number("tau", 1, 1e-9, 1e9);
+    EpisodicMemory memory(config, 0);
+    memory.e = e.values;
+    memory.actions = actions.values;
+    std::vector<double> e_hat, w;
+    std::vector<float> a_hat;
+    for (size_t i = 0; i < n; ++i) {
+        std::vector<Neighbour> found;
+        for (size_t k = i * K; k < i * K + static_cast<size_t>(count.values[i]); ++k)
+            found.push_back({distance.values[k], static_cast<uint32_t>(k)});
+        e_hat.push_back(memory.approximate_return(found));
+        w.push_back(memory.weight(found, d.values[i], alpha));
+        const bool drawn = !memory.is_optimal(found, d.values[i]);
+        const float* action = drawn ? memory.remembered_action(found, uniform.values[i]) : nullptr;
+        for (size_t j = 0; j < memory.A; ++j) a_hat.push_back(drawn ? action[j] : NAN);
+    }
+    c.expect("memory/e_hat", {n}, e_hat);
+    c.expect("memory/w", {n}, w);
+    c.expect("memory/a_hat", {n, memory.A}, a_hat);
+}
 
 // parameter/NAME and the batch of read_windows() and read_batch(), noise [n, A] or [updates, n, A]: the same batch,
 // again and again. -> of the first update layer/NAME, layer_gradient/NAME, gradient/NAME; of every update L, H, loss,
@@ -1264,8 +1310,13 @@ void check_step(Case& c) {
         noise = c.in<float>("noise", shape).values;
     }
     Optimizer optimizer;
+    optimizer.updates = static_cast<uint64_t>(c.whole("updates_before", 0, 0, 1e15));
+    read_moments(c, model->parameters, optimizer);
     Temperature temperature(1);
     temperature.log_lambda[0].value[0] = static_cast<float>(log_lambda);
+    temperature.optimizer.updates = optimizer.updates;
+    read_moments(c, temperature.log_lambda, temperature.optimizer);
+    check_advice(c);
     Tape<T> tape(c.compute);
     std::vector<double> L, H, loss, norms;
     std::vector<float> log_temperature;
@@ -1552,7 +1603,13 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
 
 }  // namespace vectors
 
+#include "dump.hpp"
+
 void command_check(const Arguments& arguments) {
+    const bool dumps = !arguments["--dump"].empty();
+    if (dumps == arguments["--run"].empty() || dumps != arguments.words.empty())
+        fail("usage.words", "wodtem check takes vector files, or --dump FILE --run DIR");
+    if (dumps) return vectors::dump_run(arguments["--dump"], {arguments["--run"]}, arguments);
     Compute compute(choose_kernel(arguments["--kernel"]), thread_count(arguments));
     size_t bad = 0;
     for (const std::string& path : arguments.words) {

@@ -263,7 +263,7 @@ void compare_with_plain(const EpisodicMemory& memory, uint64_t salt, uint32_t n 
 
 // ---- Returns and replay
 
-// WODTEM sec. III-A test
+// WODTEM sec. III-A, g_t test; WODTEM sec. III-A, d_t test
 TEST(returns_are_the_sums_of_their_definition) {
     const Random random{test_seed(), Stream::data_set};
     std::vector<float> rewards;
@@ -307,6 +307,7 @@ TEST(offline_set_drops_exactly_one_lowest_return) {
     CHECK_FAILS("memory.not_relabelled", offline_set({Trajectory{}, Trajectory{}}, false));
 }
 
+// WODTEM sec. III-A, D_online test
 TEST(replay_starts_from_low_to_high_return_and_overwrites_from_the_lowest) {
     ReplayBuffer replay{.state_dim = 1, .action_dim = 1, .gamma = gamma_dr, .capacity = 3};
     const auto marks = [&] {
@@ -329,6 +330,7 @@ TEST(replay_starts_from_low_to_high_return_and_overwrites_from_the_lowest) {
     CHECK_EQUAL(marks(), "dac");
 }
 
+// WODTEM sec. III-B, C^t test
 TEST(replay_samples_every_step_alike_and_cuts_windows_at_the_end) {
     ReplayBuffer replay{.state_dim = 1, .action_dim = 1, .gamma = gamma_dr, .capacity = 4};
     const Random random{test_seed(), Stream::batch};
@@ -416,7 +418,7 @@ TEST(a_refused_trajectory_or_query_leaves_the_table_as_it_was) {
     CHECK_FAILS("memory.config", wrong = small(); wrong.tau = NAN; EpisodicMemory(wrong, 1));
 }
 
-// WODTEM sec. IV-B.1 test
+// WODTEM sec. IV-B.1, full table test
 TEST(a_full_table_forgets_the_least_frequently_or_least_recently_used) {
     MemoryConfig config = small();
     config.capacity = 3;
@@ -435,6 +437,7 @@ TEST(a_full_table_forgets_the_least_frequently_or_least_recently_used) {
     CHECK(table_of(config, {{1, 0, 0}, {1, 0, 0}, {2, 0, 0}, {3, 0, 0}}).projected == std::vector<float>{3});
 }
 
+// WODTEM eq. (4) test; WODTEM sec. IV-B.1, full table test
 TEST(table_agrees_with_a_naive_map_over_random_operations) {
     MemoryConfig config = {.state_dim = 2, .action_dim = 1, .projected_dim = 0, .capacity = 60, .K = 3, .epsilon = 0.5};
     compare_with_naive(config, 100000, 1);
@@ -461,6 +464,7 @@ TEST(two_million_entries_fit_in_400_megabytes) {
 
 // ---- Neighbours
 
+// WODTEM sec. IV-B.2, K(s_q) test
 TEST(the_tree_finds_what_a_linear_scan_finds) {
     const Random random{test_seed(), Stream::data_set};
     struct Case {
@@ -586,7 +590,7 @@ TEST(lookup_prefers_older_entry_on_tie) {
     CHECK(entries_of(search(memory, &zero)) == std::vector<uint32_t>{2});  // older, though in a later slot
 }
 
-// WODTEM sec. IV-B.2 test
+// WODTEM sec. IV-B.2, K(s_q) test; WODTEM sec. IV-B.2, q test
 TEST(neighbours_lie_strictly_within_epsilon) {
     MemoryConfig config = small();
     const float zero = 0.0f;
@@ -610,6 +614,7 @@ TEST(neighbours_lie_strictly_within_epsilon) {
     CHECK(entries_of(search(memory, &own)) == std::vector<uint32_t>{2});
 }
 
+// WODTEM sec. IV-B.1, projection test
 TEST(projection_keeps_squared_lengths_on_average_and_depends_on_the_seed) {
     std::vector<float> state(50, 1.0f);
     double mean = 0.0;
