@@ -128,8 +128,7 @@ inline Moments sampled_returns(Tape<float>& tape, sac::Network<float>& policy, a
     return returns;
 }
 
-constexpr uint64_t training_evaluations = uint64_t{1}
-                                          << 40;  // numbers of their episodes start here, the same each time
+constexpr uint64_t training_evaluations = uint64_t{1} << 40;  // the numbers of their episodes, each time the same
 
 // Evaluates the policy after every `evaluate_every` updates, at first with a quarter of the episodes; the whole number
 // decides where that is within four times the tolerance. Begins from the checkpoint if there is one; saves one when it

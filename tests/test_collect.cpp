@@ -274,6 +274,27 @@ TEST(ant_maze_actions_are_the_walkers_plus_noise) {
     CHECK_CLOSE(noise.deviation(), 0.2, 5 * 0.2 / std::sqrt(16000));
 }
 
+TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
+    const Scratch scratch("antmaze");
+    const MujocoTask& task = task_of("antmaze-umaze");
+    const std::string path = scratch / "set.hdf5";
+    constexpr size_t steps = 4 * 701;
+    collect_antmaze(path, task, steps, {"test", test_seed()}, embedded_policy(walker_name), [](size_t) {});
+    const Hdf5File file = open_hdf5(path);
+    const std::pair<const char*, const char*> types[] = {
+        {"observations", "float32"}, {"actions", "float32"},    {"rewards", "float32"},    {"terminals", "float32"},
+        {"timeouts", "bool"},     {"infos/goal", "float32"}, {"infos/qpos", "float32"}, {"infos/qvel", "float32"}};
+    for (const auto& [name, type] : types) CHECK(file.find(name) && file.find(name)->type == type);
+    CHECK(!file.find("next_observations"));
+    const Rows rows = read_rows(file);
+    CHECK(rows.count == steps && rows.state_dim == 29 && rows.action_dim == 8);
+    // Nine in ten episodes arrive, so of four hardly ever none does.
+    CHECK(std::count(rows.rewards.begin(), rows.rewards.end(), 1.0f) > 0);
+    CHECK_FAILS("collect.policy",
+                collect_antmaze(path, task, 10, {"", 0}, embedded_policy("hopper-medium"), [](size_t) {}));
+    CHECK_FAILS("collect.policy", embedded_policy("hopper-expert"));
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Training to a level
 
@@ -372,6 +393,18 @@ TEST(trainings_have_the_published_levels_and_sizes) {
         CHECK_EQUAL(training.name, std::string(task) + "-medium");
     }
     CHECK_CLOSE(normalised_score(task_of("ant"), medium_return(task_of("ant"))), 80.30, 0.005);
+}
+
+// Within a tenth, as the mean of a whole set; ten episodes add three standard errors.
+TEST(shipped_policies_have_the_published_returns) {
+    Tape<float> tape(one_thread());
+    for (const char* name : {"hopper", "halfcheetah"}) {
+        sac::SavedPolicy policy = embedded_policy(std::string(name) + "-medium");
+        LiveTask environment(task_of(name));
+        const Moments returns = sampled_returns(tape, policy.network, environment, test_seed(), data_set_episodes, 10);
+        const double level = medium_return(task_of(name));
+        CHECK_CLOSE(returns.mean(), level, 0.1 * level + 3 * returns.deviation() / std::sqrt(returns.count));
+    }
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -505,6 +505,28 @@ TEST(sac_refuses_discrete_actions_and_a_replay_below_an_episode) {
     CHECK_FAILS("sac.settings", sac::Learner(settings, {1, 1, 8, 5}, one_thread()));
     settings.capacity = 4;
     CHECK_FAILS("sac.settings", sac::Learner(settings, {1, 1, 0, 5}, one_thread()));
+    settings = small_settings();
+    settings.steps_per_update = 0;
+    CHECK_FAILS("sac.settings", sac::Learner(settings, {1, 1, 0, 5}, one_thread()));
+}
+
+TEST(sac_updates_at_every_nth_step_once_acting_at_random_is_over) {
+    sac::Settings settings = small_settings();
+    settings.random_steps = 10;
+    settings.steps_per_update = 3;
+    Rail environment;
+    sac::Learner learner(settings, environment.spec(), one_thread());
+    std::vector<uint64_t> at;  // the steps of the updates
+    while (learner.progress.steps < 20) {
+        const uint64_t before = learner.progress.updates;
+        learner.step(environment);
+        if (learner.progress.updates == before + 1) at.push_back(learner.progress.steps);
+    }
+    CHECK(at == (std::vector<uint64_t>{12, 15, 18}));
+    const std::vector<float> policy = learner.policy.parameters[0].value;
+    for (int i = 0; i < 10; ++i) learner.interact(environment);  // acts, and learns nothing
+    CHECK(learner.progress.updates == 3 && learner.progress.steps == 30 && learner.replay.size() == 30);
+    CHECK(learner.policy.parameters[0].value == policy);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
