@@ -2637,7 +2637,7 @@ void print_help(const Command* command) {
         for (const PublishedDataSet& set : published_data_sets)
             std::printf("  %-30s %8zu  %s\n", set.id, set.steps,
                         set.collected_in ? set.collected_in : "needs --policy, which its medium-replay set ends with");
-        std::printf("  %-30s %8s  the policy of the antmaze sets, trained anew; 10 minutes\n", walker_name, "");
+        std::printf("  %-30s %8s  the policy of the antmaze sets, trained anew; 60,000 updates\n", walker_name, "");
         std::printf("A training that was stopped goes on with the same command.\n");
     }
     if (std::string(command->name) == "train") {

@@ -31,8 +31,7 @@ struct PublishedDataSet {
     const char* sha256;
     int trajectories;  // complete ones
     double mean_return, deviation, high, low;
-    const char*
-        collected_in;  // how long `wodtem collect` takes on one core, as measured; null: it has no policy to use
+    const char* collected_in;  // what `wodtem collect` takes on one core, as measured; null: it has no policy to use
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
 constexpr std::array<PublishedDataSet, 13> published_data_sets{{
@@ -41,23 +40,24 @@ constexpr std::array<PublishedDataSet, 13> published_data_sets{{
      "1 minute"},
     {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 75854457,
      "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 2041, 467.30, 511.03, 3192.93, -1.44,
-     "20 minutes"},
+     "5 ms an update, 80,000 of them or more"},
     {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 232254996,
      "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 1190, 2852.09, 1095.44, 4226.94, -6.61,
      nullptr},
     {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 86323963,
      "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 1093, 682.70, 895.96, 4132.00, -50.20,
-     "an hour"},
+     "5 ms an update, 140,000 of them or more"},
     {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 237727262,
      "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 1000, 4770.33, 355.75, 5309.38, -310.23,
      "30 seconds"},
     {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 59448533,
      "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 202, 3093.29, 1680.69, 4985.14, -638.49,
-     "20 minutes"},
+     "5 ms an update, 70,000 of them or more"},
     {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 376239825,
      "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 1202, 3051.26, NAN, NAN, NAN, nullptr},
     {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 136482252,
-     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 485, 975.94, NAN, NAN, NAN, "hours"},
+     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 485, 975.94, NAN, NAN, NAN,
+     "5 ms an update, 65,000 of them or more"},
     {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
      1000000, 232532949, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", 0, NAN, NAN, NAN, NAN,
      "5 minutes"},
@@ -101,9 +101,13 @@ inline std::string find_data_set(const PublishedDataSet& set) {
         if (std::filesystem::exists(path)) return path;
         looked += (looked.empty() ? "" : " and ") + path;
     }
-    const std::string advice = set.collected_in ? "a stand-in is made in about " + std::string(set.collected_in) +
-                                                      " by: wodtem collect " + set.id
-                                                : "this version makes no stand-in; give a file with --dataset FILE";
+    const std::string id = set.id, replay = std::string(find_mujoco_task(id)->name) + "-medium-replay-v2";
+    const std::string advice = set.collected_in
+                                   ? "a stand-in is made by: wodtem collect " + id + " (" + set.collected_in +
+                                         "); or give a file with --dataset"
+                                   : "this version holds no policy that makes a stand-in: wodtem collect " + replay +
+                                         " trains one, for wodtem collect " + id +
+                                         " --policy FILE; or give a file with --dataset";
     fail("dataset.missing", "the data set of %s is not here: looked for %s. The original is published at %s%s; %s",
          set.id, looked.c_str(), published_address, set.file, advice.c_str());
 }

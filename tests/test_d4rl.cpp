@@ -144,6 +144,11 @@ TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
     CHECK_EQUAL(file_name(set), "maze2d-large-sparse-v1.hdf5");
     if (!std::filesystem::exists(std::string(own_folder) + "/" + file_name(set))) {
         CHECK_FAILS("dataset.missing", find_data_set(set));
+        try {
+            find_data_set(*find_published("ant-medium-v2"));
+        } catch (const Error& error) {
+            CHECK(std::string(error.what()).find("wodtem collect ant-medium-replay-v2") != std::string::npos);
+        }
     }
     write_file_atomic(folder + "/maze2d-large-sparse-v1.hdf5", "x");
     CHECK_EQUAL(find_data_set(set), folder + "/maze2d-large-sparse-v1.hdf5");
