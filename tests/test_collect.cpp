@@ -283,7 +283,7 @@ TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
     const Hdf5File file = open_hdf5(path);
     const std::pair<const char*, const char*> types[] = {
         {"observations", "float32"}, {"actions", "float32"},    {"rewards", "float32"},    {"terminals", "float32"},
-        {"timeouts", "bool"},     {"infos/goal", "float32"}, {"infos/qpos", "float32"}, {"infos/qvel", "float32"}};
+        {"timeouts", "bool"},        {"infos/goal", "float32"}, {"infos/qpos", "float32"}, {"infos/qvel", "float32"}};
     for (const auto& [name, type] : types) CHECK(file.find(name) && file.find(name)->type == type);
     CHECK(!file.find("next_observations"));
     const Rows rows = read_rows(file);
