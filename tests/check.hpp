@@ -1092,6 +1092,8 @@ struct CheckedTemperature {
         OptimizerConfig config;
         config.rule = OptimizerConfig::Rule::adamw;
         config.learning_rate = settings.lambda_learning_rate;
+        config.weight_decay = 0;
+        config.warmup_updates = 0;
         update_lambda(c.compute, temperature, settings, H);
         slack->add(before, {std::exp(before[0][0]) * H_off}, 1, temperature.optimizer, config);
         log_lambda.push_back(temperature.log_lambda[0].value[0]);
