@@ -217,7 +217,8 @@ inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& whi
 // allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: collection stopped there.
 // Where a file has no timeouts (the first versions), `limit` steps end one too. The gym sets of replay buffers also have
 // timeouts at the ends of collection blocks; they cut, as in D4RL. maze2d: terminals are all 0, and timeouts mark that a
-// navigation goal was reached; the body is not reset, and the next row starts where this one ended.
+// navigation goal was reached; the body is not reset, and the next row starts where this one ended. So the trajectories
+// with the highest returns are those that leave the rewarded goal (see the README).
 inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
     std::vector<Trajectory> trajectories;
     std::vector<size_t> open;  // rows of the trajectory that has not ended yet

@@ -230,8 +230,9 @@ using Shape = std::vector<uint64_t>;  // {} is a scalar: one element
 
 inline std::string shape_text(const Shape& shape) {
     std::string text = "[";
-    for (const uint64_t extent : shape) text += (text.size() > 1 ? ", " : "") + std::to_string(extent);
-    return text + "]";
+    for (const uint64_t extent : std::span(shape).first(std::min<size_t>(shape.size(), 16)))
+        text += (text.size() > 1 ? ", " : "") + std::to_string(extent);
+    return text + (shape.size() > 16 ? ", ... of " + std::to_string(shape.size()) : "") + "]";
 }
 
 // False if the size in bytes does not fit 64 bits.
@@ -537,8 +538,8 @@ inline void check_layout(TensorFile& file) {
             fail("safetensors.offsets", "%s: begins at data offset %zu, expected %zu: %s", where.c_str(), tensor.begin,
                  next, tensor.begin < next ? "tensors overlap" : "there is a hole");
         if (tensor.size > available - next)
-            fail("safetensors.truncated", "%s: needs %zu bytes of data, %zu are left; the file was cut off",
-                 where.c_str(), tensor.size, available - next);
+            fail("safetensors.truncated", "%s at byte %zu: needs %zu bytes of data, %zu are left; the file was cut off",
+                 where.c_str(), file.data_start + next, tensor.size, available - next);
         next += tensor.size;
     }
     if (next != available)
@@ -574,14 +575,16 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
     file.buffer = std::move(bytes);
     size_t length = 0;
     const size_t size = file.buffer.size();
-    if (size < 8) fail("safetensors.truncated", "%s: %zu bytes are too few for a header length", path.c_str(), size);
+    if (size < 8)
+        fail("safetensors.truncated", "%s: offset 0: %zu bytes are too few for a header length", path.c_str(), size);
     std::memcpy(&length, file.buffer.data(), 8);
     if (length > header_limit)
         fail("safetensors.header_length", "%s: offset 0: header length %zu is above %zu; not a safetensors file?",
              path.c_str(), length, header_limit);
     if (length > size - 8)
-        fail("safetensors.truncated", "%s: the header should have %zu bytes, %zu follow; the file was cut off",
-             path.c_str(), length, size - 8);
+        fail("safetensors.truncated",
+             "%s: offset 8: the header should have %zu bytes, %zu follow; the file was cut off", path.c_str(), length,
+             size - 8);
     file.data_start = 8 + length;
 
     HeaderReader reader{std::string_view(file.buffer).substr(0, file.data_start), path};

@@ -37,7 +37,7 @@ function stop(why) { print "tests/mutants.txt:" NR ": " why > "/dev/stderr"; fai
     if (index(substr(text[file], at + 1), before old after)) { stop("more than once in " file ": " before old after); next }
     ++count
     of[count] = file; from[count] = at + length(before); to[count] = from[count] + length(old); version[count] = new
-    print count " " field[1] > (work "/numbers")
+    print count " " field[1] > (work "/list.txt")
 }
 END {
     if (failed) exit 1
@@ -100,6 +100,6 @@ while read -r number name; do
         survivors=$((survivors + 1))
         echo "$name: SURVIVES"
     fi
-done < numbers
+done < list.txt
 echo "$((by_check + by_tests + survivors)) mistakes: $by_check found by wodtem check ($meant in the file that is meant to)," \
     "$by_tests more by the tests, $survivors not found"

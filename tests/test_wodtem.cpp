@@ -489,6 +489,11 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
     CHECK(chi_square < 29.9);  // 7 degrees of freedom: exceeded once in 10,000 seeds
 }
 
+TEST(a_move_of_probability_zero_is_never_drawn) {
+    const float log_p[] = {-INFINITY, 0, -INFINITY};
+    for (const double uniform : {0.0, 0.5, 1 - 0x1p-53}) CHECK_EQUAL(sampled_move(log_p, 3, uniform), 1);
+}
+
 // WODTEM sec. III-B, g_{t+1} test: with rewards on the way, of which the grid world has none.
 TEST(the_return_to_go_falls_by_each_reward) {
     struct Paying {
