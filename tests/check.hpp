@@ -26,23 +26,27 @@ struct Tolerance {
 Tolerance parse_tolerance(const std::string& text, const std::string& where) {
     Tolerance tolerance;
     const size_t colon = text.find(':');
-    const std::string head = text.substr(0, colon);
+    if (text.substr(0, colon) == "exact" && colon != std::string::npos) return {true, 0, 0, 0};
+    bool good = colon != std::string::npos;
     std::set<std::string> words;
-    const auto read = [&](const std::string& item) {
-        const size_t begin = item.find_first_not_of(' '), end = item.find_last_not_of(' ') + 1;
-        const size_t space = item.find(' ', begin);
-        const std::string word = begin < space && space < end ? item.substr(begin, space - begin) : "";
-        const size_t digits = word.empty() ? begin : item.find_first_not_of(' ', space);
-        const auto x = digits < end ? to_number(item.substr(digits, end - digits)) : std::nullopt;
-        if (!x || *x < 0 || !words.insert(word.empty() ? "float64" : word).second) return false;
-        if (word == "absolute") tolerance.absolute = *x;
-        if (word == "float64" || word.empty()) tolerance.float64 = *x;
-        if (word == "float32" || (word.empty() && *x > 0x1p-24)) tolerance.float32 = *x;
-        return word.empty() ? words.size() == 1 : word == "float64" || word == "float32" || word == "absolute";
-    };
-    const std::vector<std::string> items = split(head, ',');
-    if (colon != std::string::npos && head == "exact") return {true, 0, 0, 0};
-    if (colon == std::string::npos || !std::all_of(items.begin(), items.end(), read))
+    for (const std::string& item : split(text.substr(0, colon), ',')) {
+        std::vector<std::string> parts = split(item, ' ');
+        std::erase(parts, "");
+        const bool bare = parts.size() == 1;
+        const std::string word = parts.size() == 2 ? parts[0] : "float64";
+        const auto x = bare || parts.size() == 2 ? to_number(parts.back()) : std::nullopt;
+        good = good && x && *x >= 0 && (!bare || words.empty()) && words.insert(word).second;
+        if (good && word == "absolute")
+            tolerance.absolute = *x;
+        else if (good && word == "float64")
+            tolerance.float64 = *x;
+        else if (good && word == "float32")
+            tolerance.float32 = *x;
+        else
+            good = false;
+        if (good && bare && *x > 0x1p-24) tolerance.float32 = *x;
+    }
+    if (!good)
         fail("check.tolerance",
              "%s is %s, expected \"exact: REASON\", or any of these with a colon after the last: \"float64 1e-12, "
              "float32 1e-6, absolute 0: REASON\"",
@@ -983,7 +987,7 @@ Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& confi
     if (config.head == Head::squashed_gaussian)
         for (const char* name : {"actions", "remembered_actions"})
             if (c.has(std::string("in/") + name))
-                squashed_actions_in(c, name, windows.rows_of(batch.actions.size() / batch.weights.size()));
+                squashed_actions_in(c, name, windows.rows_of(static_cast<uint64_t>(config.action_dim)));
     if (c.has("in/weights")) c.in_range("weights", windows.steps, 0.0f, 1.0f, "from 0 to 1");
     const std::vector<int>& lengths = windows.sequences.lengths;
     for (const int length : lengths)
@@ -1017,11 +1021,11 @@ struct Slack {
         }
     }
 
-    // After an update. before: the values; gradient_off: what may be wrong with each gradient, before clipping by
-    // `clip`. Storage rounds to float32 (AdamW: three times, by its decay). Adam divides a gradient by its own
-    // size: where that is near rounding, as in the keys' bias, which softmax does not see, the step is noise over noise.
-    // With entries off by `off`, so are m and sqrt(v), and u = m / (sqrt(v) + epsilon) by (1 + |u|) off / (sqrt(v) +
-    // epsilon), or by 2 where that is more; by LAMB's ratio the norm of all that reaches every entry.
+    // After an update. before: the values; gradient_off: what may be wrong with each gradient, before it is scaled by
+    // `clip`. Storage rounds to float32 (with AdamW's decay three times). Adam divides a gradient by its own size: where
+    // that is near rounding, as in the keys' bias, which softmax does not see, the step is noise over noise. Entries of
+    // a gradient are off by `off` at most, so are m and sqrt(v), and u = m / (sqrt(v) + epsilon) by (1 + |u|) off /
+    // (sqrt(v) + epsilon), or by 2 where that is more; by LAMB's ratio the norm of all that reaches every entry.
     void add(const std::vector<std::vector<float>>& before, const std::vector<double>& gradient_off, double clip,
              const Optimizer& optimizer, const OptimizerConfig& config) {
         const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
@@ -1342,7 +1346,11 @@ int wanted_updates(Case& c) {
                 for (const uint64_t extent : c.need("out/" + name).shape)
                     most = std::max(most, static_cast<int>(std::min<uint64_t>(extent, 1 << 20)));
     }
-    return static_cast<int>(c.whole("updates", most, most, 100000));
+    constexpr int limit = 1000;
+    if (most > limit)
+        fail("check.value", "%s: case %s asks for %d updates, %d are the most: rounding grows from update to update",
+             c.file.path.c_str(), c.name.c_str(), most, limit);
+    return static_cast<int>(c.whole("updates", most, most, limit));
 }
 
 // Moments of an optimiser that has made updates before: first_moment/NAME, second_moment/NAME; left out: zeros.
@@ -1388,6 +1396,23 @@ void check_advice(Case& c) {
     c.expect("memory/e_hat", {n}, e_hat);
     c.expect("memory/w", {n}, w);
     c.expect("memory/a_hat", {n, memory.A}, a_hat);
+}
+
+// What may be wrong with each gradient: float32's rounding, a part of its largest entry, or that of the parameters, but
+// no more than 16 times the former: further apart the two networks say nothing of steps.
+std::vector<double> gradient_off(const std::vector<Parameter<float>>& parameters, double relative,
+                                 const Transformer<double>* unrounded) {
+    std::vector<double> off;
+    for (size_t p = 0; p < parameters.size(); ++p) {
+        double largest = 0, apart = 0;
+        for (size_t i = 0; i < parameters[p].gradient.size(); ++i) {
+            const double g = parameters[p].gradient[i];
+            largest = std::max(largest, std::fabs(g));
+            if (unrounded) apart = std::max(apart, std::fabs(g - unrounded->parameters[p].gradient[i]));
+        }
+        off.push_back(std::clamp(apart, relative * largest, 16 * relative * largest));
+    }
+    return off;
 }
 
 // parameter/NAME and the batch of read_windows() and read_batch(), noise [n, A] or [updates, n, A]: the same batch,
@@ -1473,17 +1498,7 @@ void check_step(Case& c) {
                 unrounded_tape.reset();
                 there = numbers(learn(unrounded_tape, *unrounded, batch, update_noise, temperature, constrain));
             }
-            const double relative = c.tolerance("gradient").float32;
-            std::vector<double> off;  // of the gradients: float32's rounding, and that of the parameters
-            for (size_t p = 0; p < model->parameters.size(); ++p) {
-                const std::vector<float>& g = model->parameters[p].gradient;
-                double largest = 0, apart = 0;
-                for (size_t i = 0; i < g.size(); ++i) {
-                    largest = std::max<double>(largest, std::fabs(g[i]));
-                    if (unrounded) apart = std::max(apart, std::fabs(g[i] - unrounded->parameters[p].gradient[i]));
-                }
-                off.push_back(std::max(relative * largest, apart));
-            }
+            const auto off = gradient_off(model->parameters, c.tolerance("gradient").float32, unrounded.get());
             const auto before = values_of(model->parameters);
             const OptimizerConfig optimizer_settings = optimizer_config(settings);
             const double norm = update_parameters(c.compute, model->parameters, optimizer, optimizer_settings);
@@ -1717,7 +1732,8 @@ void check_case(Case& c, const Topic& topic) {
     }
 }
 
-// Prints a line, and more of what does not hold. Returns whether all does. Errors: what makes the file none of vectors.
+// Prints a line, and more of what does not hold. Returns whether all does. Errors: what makes the file none of vectors,
+// and, after all cases were computed, the first that is malformed.
 bool check_file(const std::string& path, Compute& compute, bool verbose) {
     const TensorFile file = read_safetensors(path);
     const std::string& name = file.text("topic");

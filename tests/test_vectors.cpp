@@ -672,12 +672,23 @@ TEST(a_vector_that_is_refused_says_which_tensor_and_entry) {
     CHECK(says(look_up, "got 0, expected nan, exactly"));
     CHECK(check(with_text(with(look_up, "a/out/e_hat", {1}, std::array{0.0}), "a.epsilon", "inf")).holds);
     // A case that must raise an error: none comes, another one comes, and outputs are of no use.
-    const TensorFile error = with_text(without(look_up, "a/out/e_hat"), "a.result", "memory.not_finite");
-    CHECK(!check(error).holds && says(error, "expected the error memory.not_finite, none came"));
-    CHECK(check(with(error, "a/in/query", {1, 1}, std::array{nan})).holds);
-    CHECK(says(with_text(with(error, "a/in/query", {1, 1}, std::array{nan}), "a.result", "memory.shape"),
+    const TensorFile raises = with_text(without(look_up, "a/out/e_hat"), "a.result", "memory.not_finite");
+    CHECK(!check(raises).holds && says(raises, "expected the error memory.not_finite, none came"));
+    CHECK(check(with(raises, "a/in/query", {1, 1}, std::array{nan})).holds);
+    CHECK(says(with_text(with(raises, "a/in/query", {1, 1}, std::array{nan}), "a.result", "memory.shape"),
                "expected the error memory.shape, got memory.not_finite: "));
     CHECK_FAILS("check.unknown", check(with_text(look_up, "a.result", "memory.not_finite")));
+    // A file that was cut off: where.
+    const std::string bytes = serialise_safetensors(small_linear());
+    for (const auto& [length, part] : {std::pair{size_t{5}, "offset 0: "},
+                                       {size_t{100}, "offset 8: "},
+                                       {bytes.size() - 4, "\"a/out/y\" at byte "}}) {
+        try {
+            check_bytes(bytes.substr(0, length));
+        } catch (const Error& error) {
+            CHECK(std::string(error.what()).find(part) != std::string::npos);
+        }
+    }
     CHECK(says(with(small_linear(), "a/in/bias", Shape(1000, 1), std::array{1.0f}), "... of 1000]"));
 }
 
