@@ -635,6 +635,8 @@ TEST(inputs_of_vectors_that_mean_nothing_are_refused) {
     CHECK_FAILS("check.shape", check(with(step, "grid/out/loss", {1}, std::array{loss[0]})));
     CHECK_FAILS("check.shape", check(with(step, "grid/out/H", {1}, std::array{numbers(step, "grid/out/H")[0]})));
 
+    CHECK_FAILS("check.value", check(with_text(step, "grid.updates", "1001")));
+
     TensorFile none;
     none.metadata = {{"topic", "linear"}, {"cases", "0"}};
     CHECK_FAILS("check.count", check(none));
