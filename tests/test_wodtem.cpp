@@ -993,7 +993,7 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
                 1, "another task's");
     check_shell("./wodtem collect hopper-medium --policy README.md --out " + (scratch / "x.hdf5"), 1, "README.md");
     CHECK(!fs::exists(scratch / "x.hdf5") && !fs::exists(scratch / "x.hdf5.tmp"));
-    check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  5 ms an update");
+    check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  85,000 updates of 5 ms");
     check_shell("./wodtem collect maze2d-umaze --steps 0", 2, "nearest is 1");
 }
 
