@@ -144,18 +144,24 @@ int products_of_parts(const Kernel& kernel) { return kernel.parts > 0 ? kernel.p
 
 std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic; }
 
+EACH_TARGET float sum_of(const float* x, size_t n) {
+    typedef float Lanes __attribute__((vector_size(256), aligned(4), may_alias));  // four vectors of 16 in flight
+    Lanes sums = {};
+    for (size_t i = 0; i + 64 <= n; i += 64) sums += *reinterpret_cast<const Lanes*>(x + i);
+    float sum = 0;
+    for (int i = 0; i < 64; ++i) sum += sums[i];
+    return sum;
+}
+
 // Bytes a second that `threads` read from memory beyond any cache.
 double bench_memory_bandwidth(Measurements& measured, int threads) {
-    const size_t count = size_t{1} << 26;  // 256 MB
+    constexpr size_t count = size_t{1} << 26, tasks = 64;  // 256 MB
     const std::vector<float> x(count, 1.0f);
     Threads workers(threads);
-    std::vector<float> sums(64);
+    std::vector<float> sums(tasks);
     const Spread time = timed(5, [&] {
-        workers.run(64, [&](int task, int) {
-            const size_t share = count / 64;
-            std::vector<float> ones(4096, 1.0f);
-            for (size_t i = 0; i < share; i += 4096)
-                sums[static_cast<size_t>(task)] += dot(&x[static_cast<size_t>(task) * share + i], ones.data(), 4096);
+        workers.run(tasks, [&](int task, int) {
+            sums[static_cast<size_t>(task)] = sum_of(&x[static_cast<size_t>(task) * (count / tasks)], count / tasks);
         });
     });
     const double bytes = static_cast<double>(count * sizeof(float));
@@ -318,10 +324,9 @@ void bench_update(Measurements& measured, const Kernel& kernel, int threads, dou
             run.acting.reset();
             forward(run.acting, run.agent.model, batch, Ask::last_state);
         });
-        const double d = static_cast<double>(settings.width),
-                     tokens = 3.0 * static_cast<double>(settings.context_length) - 1,
+        const double d = static_cast<double>(settings.width), tokens = 3.0 * batch.lengths[0] - 1,
                      layers = static_cast<double>(settings.layers);
-        measured.add({"acting, one step of the gym network at full windows",
+        measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]),
                       std::to_string(episodes) + " episodes, " + label(kernel), time,
                       2 * static_cast<double>(episodes) *
                           ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d)});
