@@ -181,10 +181,10 @@ class Threads {
     int count() const { return static_cast<int>(workers_.size()) + 1; }
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
-    // f must not throw and must not call run().
+    // f must not throw and must not call run(). `serial`: the calling thread alone.
     template <class F>
-    void run(int tasks, F&& f) {
-        if (workers_.empty() || tasks < 2) {
+    void run(int tasks, F&& f, bool serial = false) {
+        if (serial || workers_.empty() || tasks < 2) {
             for (int task = 0; task < tasks; ++task) f(task, 0);
             return;
         }
@@ -715,30 +715,40 @@ struct alignas(64) Line {
 };
 inline size_t lines_for(size_t bytes) { return (bytes + 63) / 64; }
 
+// Scratch memory that grows to what was once asked for.
+struct Buffer {
+    std::vector<Line> lines;
+    char* room(size_t bytes) {
+        if (lines.size() < lines_for(bytes)) lines.resize(lines_for(bytes));
+        return lines[0].bytes;
+    }
+};
+
 // Threads, kernel and scratch memory: what every operation below needs in order to run.
 struct Compute {
-    static constexpr int block_tiles = 8;  // tiles of rows of A that a task packs: they stay in a core's second cache
+    static constexpr int block_rows = 192;            // of A, that a task packs: for a core's second cache
+    static constexpr size_t stretch_bytes = 4 << 20;  // of B that is packed at a time: for the cache that cores share
     const Kernel& kernel;
     Threads threads;
-    std::vector<Line> packed_b;               // a stretch of B, in panels of tile_columns
-    std::vector<std::vector<Line>> packed_a;  // one per worker
+    Buffer packed_b;               // a stretch of B, in panels of tile_columns
+    std::vector<Buffer> packed_a;  // one per worker
+    Buffer sums;                   // of sums_of_blocks
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
-          packed_a(static_cast<size_t>(thread_count),
-                   std::vector<Line>(lines_for(chosen.panel_bytes(block_tiles * chosen.tile_rows, chosen.depth())))) {}
+          packed_a(static_cast<size_t>(thread_count)) {}
 };
 
-inline int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
-
+inline int share(int n, int parts) { return (n + parts - 1) / parts; }  // rounded up
 // Rows and columns of C that a task works on.
 struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
 // The product of a block of rows with panels of B, for one stretch of k.
-inline void matmul_block(const Kernel& kernel, char* packed_a, View<float> c, View<const float> a, View<const float> b,
+inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a, View<const float> b,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
+    char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, kernel.depth()));
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
     const size_t a_panel = kernel.panel_bytes(kernel.tile_rows, depth),
                  b_panel = kernel.panel_bytes(kernel.tile_columns, depth);
@@ -760,93 +770,87 @@ inline void matmul_block(const Kernel& kernel, char* packed_a, View<float> c, Vi
     kernel.prepare(false);
 }
 
+// Packs the panels [first, end) of B for one stretch of k, side by side.
+inline void pack_panels(const Kernel& kernel, char* packed_b, View<const float> b, int first, int end, int N,
+                        int first_k, int depth) {
+    const int width = kernel.tile_columns;
+    for (int p = first; p < end; ++p)
+        kernel.pack_b(packed_b + static_cast<size_t>(p) * kernel.panel_bytes(width, depth), b, first_k, p * width,
+                      depth, std::min(width, N - p * width));
+}
+
 struct Nothing {
     void operator()(const Block&) const {}
 };
 
 // The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles. A few
-// rows (acting) read B where it lies: packing it would cost as much as the product. before(block) and after(block) are
-// called for every part of C, before its first addition and after its last, while it is in a core's cache.
-template <class Before = Nothing, class After = Nothing>
+// rows (acting) read B where it lies: packing it would cost as much as the product. after(block) is called for every
+// part of C after its last addition, while it is in a core's cache.
+template <class After = Nothing>
 void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
-            Before before = {}, After after = {}) {
+            After after = {}) {
     if (M == 0 || N == 0) return;
     if (K == 0) {  // an empty sum
         for (int i = 0; store == Store::overwrite && i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
-        before(Block{0, M, 0, N});
         return after(Block{0, M, 0, N});
     }
     const Kernel& kernel = compute.kernel;
     const bool pack_b = kernel.parts > 0 || M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
-    const int threads = serial ? 1 : compute.threads.count();
-    // Tasks: blocks of rows; for a wide C and few rows, also of columns. Small enough for a fair share, no smaller.
-    const int block_rows = std::min(Compute::block_tiles * kernel.tile_rows, round_up((M + 3) / 4, kernel.tile_rows));
-    const int row_blocks = (M + block_rows - 1) / block_rows;
-    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, N / (4 * kernel.tile_columns)));
-    const int block_columns = round_up((N + column_blocks - 1) / column_blocks, kernel.tile_columns);
-    if (pack_b) {
-        const size_t lines =
-            lines_for(kernel.panel_bytes(round_up(N, kernel.tile_columns), std::min(K, kernel.depth())));
-        if (compute.packed_b.size() < lines) compute.packed_b.resize(lines);
-    }
-    char* const packed_b = pack_b ? compute.packed_b[0].bytes : nullptr;
-    const auto share_out = [&](int tasks, auto&& body) {
-        if (threads == 1)
-            for (int task = 0; task < tasks; ++task) body(task, 0);
-        else
-            compute.threads.run(tasks, body);
-    };
-    for (int first_k = 0; first_k < K; first_k += kernel.depth()) {
-        const int depth = std::min(kernel.depth(), K - first_k);
-        const int panels = (N + kernel.tile_columns - 1) / kernel.tile_columns;
-        const int panels_a_task = threads == 1 ? panels : std::max(1, panels / 8);
+    // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
+    const int tiles = share(M, kernel.tile_rows), panels = share(N, kernel.tile_columns);
+    const int row_blocks = std::max(share(tiles, Compute::block_rows / kernel.tile_rows), std::min(tiles, 4));
+    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
+    // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels.
+    const int depth = kernel.depth();
+    const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
+    const int steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, share(K, depth));
+    char* const packed = pack_b ? compute.packed_b.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
+    const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
+    for (int first_k = 0; first_k < K; first_k += steps * depth) {
+        const int end_k = std::min(K, first_k + steps * depth);
+        const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
+        const int batch = std::max(1, panels / 8);  // panels that a task packs
         if (pack_b)
-            share_out((panels + panels_a_task - 1) / panels_a_task, [&](int task, int) {
-                for (int p = task * panels_a_task; p < std::min(panels, (task + 1) * panels_a_task); ++p)
-                    kernel.pack_b(packed_b + static_cast<size_t>(p) * kernel.panel_bytes(kernel.tile_columns, depth), b,
-                                  first_k, p * kernel.tile_columns, depth,
-                                  std::min(kernel.tile_columns, N - p * kernel.tile_columns));
-            });
-        share_out(row_blocks * column_blocks, [&](int task, int worker) {
-            const int row = task / column_blocks * block_rows, column = task % column_blocks * block_columns;
-            const Block block = {row, std::min(M, row + block_rows), column, std::min(N, column + block_columns)};
-            if (first_k == 0) before(block);
-            matmul_block(kernel, compute.packed_a[static_cast<size_t>(worker)][0].bytes, c, a, b, packed_b, block,
-                         first_k, depth, first_k > 0 || store == Store::accumulate);
-            if (first_k + depth == K) after(block);
-        });
+            compute.threads.run(
+                share(end_k - first_k, depth) * share(panels, batch),
+                [&](int task, int) {
+                    const int step = task / share(panels, batch), first = task % share(panels, batch) * batch;
+                    const int k = first_k + step * depth;
+                    pack_panels(kernel, packed_b(step), b, first, std::min(panels, first + batch), N, k, depth_at(k));
+                },
+                serial);
+        compute.threads.run(
+            row_blocks * column_blocks,
+            [&](int task, int worker) {
+                const int i = task / column_blocks, j = task % column_blocks;
+                const auto row = [&](int n) { return std::min(M, tiles * n / row_blocks * kernel.tile_rows); };
+                const auto column = [&](int n) {
+                    return std::min(N, panels * n / column_blocks * kernel.tile_columns);
+                };
+                const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
+                for (int k = first_k; k < end_k; k += depth)
+                    matmul_block(kernel, compute.packed_a[static_cast<size_t>(worker)], c, a, b,
+                                 pack_b ? packed_b((k - first_k) / depth) : nullptr, block, k, depth_at(k),
+                                 k > 0 || store == Store::accumulate);
+                if (end_k == K) after(block);
+            },
+            serial);
     }
 }
 
-// In double, for checks alone: matmul_plain's sums, a few rows at a time, along rows of B.
-template <class Before = Nothing, class After = Nothing>
+// In double, for checks alone: matmul_plain row by row.
+template <class After = Nothing>
 void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
-            Store store, Before before = {}, After after = {}) {
-    before(Block{0, M, 0, N});
-    constexpr int block = 8;
-    const ptrdiff_t columns = N;
-    std::vector<double> untransposed(b.transposed ? static_cast<size_t>(K) * static_cast<size_t>(N) : 0);
-    for (int k = 0; b.transposed && k < K; ++k)
-        for (int j = 0; j < N; ++j) untransposed[static_cast<size_t>(k * columns + j)] = b(k, j);
-    const View<const double> rows_of_b = b.transposed ? View<const double>{untransposed.data(), N} : b;
-    compute.threads.run((M + block - 1) / block, [&](int task, int) {
-        std::vector<double> sums(static_cast<size_t>(block * columns));
-        const int first_row = task * block, rows = std::min(block, M - first_row);
-        for (int first = 0; first < std::max(K, 1); first += sum_block) {
+            Store store, After after = {}) {
+    compute.threads.run(M, [&](int i, int) {
+        for (int j = 0; store == Store::overwrite && j < N; ++j) c(i, j) = 0;
+        std::vector<double> sums(static_cast<size_t>(N));
+        for (int first = 0; first < K; first += sum_block) {
             std::fill(sums.begin(), sums.end(), 0.0);
             for (int k = first; k < std::min(K, first + sum_block); ++k)
-                for (int i = 0; i < rows; ++i) {
-                    const double element = a(first_row + i, k), *row = &rows_of_b(k, 0);
-                    double* sum = &sums[static_cast<size_t>(i * columns)];
-                    for (int j = 0; j < N; ++j) sum[j] += element * row[j];
-                }
-            for (int i = 0; i < rows; ++i)
-                for (int j = 0; j < N; ++j) {
-                    double& to = c(first_row + i, j);
-                    to =
-                        (first == 0 && store == Store::overwrite ? 0 : to) + sums[static_cast<size_t>(i * columns + j)];
-                }
+                for (int j = 0; j < N; ++j) sums[static_cast<size_t>(j)] += a(i, k) * b(k, j);
+            for (int j = 0; j < N; ++j) c(i, j) += sums[static_cast<size_t>(j)];
         }
     });
     after(Block{0, M, 0, N});
@@ -1003,21 +1007,35 @@ struct Tape {
 // row.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int block = std::max(1, std::min((rows + 7) / 8, 1 + 100000 / std::max(1, work)));
-    if (static_cast<double>(rows) * work < 2e4) return f(0, rows);
-    compute.threads.run((rows + block - 1) / block,
-                        [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); });
+    const int block = std::max(1, std::min(share(rows, 8), 1 + 100000 / std::max(1, work)));
+    const bool serial = static_cast<double>(rows) * work < 2e4;
+    compute.threads.run(
+        share(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
 }
 
-// to[j] += sum over rows of from[row, j]: each column alone, in order of rows.
+// to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>
-void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns) {
-    const auto sum = [=](int begin, int end) {
+void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns, ptrdiff_t stride) {
+    for_rows(compute, share(columns, 64), rows * 64, [=](int begin, int end) {
         for (int row = 0; row < rows; ++row)
-            for (int j = begin; j < end; ++j) to[j] += from[static_cast<ptrdiff_t>(row) * columns + j];
-    };
-    const int blocks = (columns + 63) / 64;
-    for_rows(compute, blocks, rows * 64, [&](int begin, int end) { sum(begin * 64, std::min(columns, end * 64)); });
+            for (int j = begin * 64; j < std::min(columns, end * 64); ++j) to[j] += from[row * stride + j];
+    });
+}
+
+// Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its block
+// of row_block rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the next call.
+constexpr int row_block = 64;
+template <class T, class F>
+const T* sums_of_blocks(Compute& compute, int rows, int columns, F&& f) {
+    const int blocks = share(rows, row_block);
+    const size_t size = static_cast<size_t>(blocks) * static_cast<size_t>(columns);
+    T* const sums = reinterpret_cast<T*>(compute.sums.room(size * sizeof(T)));
+    for_rows(compute, blocks, 8 * row_block * columns, [&](int begin, int end) {
+        std::fill(sums + static_cast<ptrdiff_t>(begin) * columns, sums + static_cast<ptrdiff_t>(end) * columns, T(0));
+        for (int row = begin * row_block; row < std::min(rows, end * row_block); ++row)
+            f(row, sums + static_cast<ptrdiff_t>(row / row_block) * columns);
+    });
+    return sums;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1065,28 +1083,23 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     const ptrdiff_t offset = transposed ? static_cast<ptrdiff_t>(first) * w.columns : first;
     Compute& compute = tape.compute;
     const auto row_of = [count](T* data, int row) { return data + static_cast<ptrdiff_t>(row) * count; };
-    const auto begin_sums = [=](const Block& b) {
-        for (int row = b.first_row; row < b.end_row; ++row)
-            std::copy(bias + b.first_column, bias + b.end_column, row_of(y.value, row) + b.first_column);
-    };
-    const auto finish_sums = [=](const Block& b) {
-        for (int row = b.first_row; row < b.end_row; ++row)
-            finish.forward(row_of(y.value, row), row, b.first_column, b.end_column);
+    const auto finish_sums = [=](const Block& block) {
+        for (int row = block.first_row; row < block.end_row; ++row) {
+            T* sums = row_of(y.value, row);
+            for (int j = block.first_column; j < block.end_column; ++j) sums[j] += bias[j];
+            finish.forward(sums, row, block.first_column, block.end_column);
+        }
     };
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed}, x.rows,
-           count, x.columns, Store::accumulate, begin_sums, finish_sums);
+           count, x.columns, Store::overwrite, finish_sums);
     T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
     tape.on_backward([=, &compute] {
-        constexpr int width = 64;  // columns at a time, row after row: finish's gradient and db in one pass
-        for_rows(compute, (count + width - 1) / width, y.rows * width * 4, [=](int begin, int end) {
-            for (int row = 0; row < y.rows; ++row)
-                for (int c = begin * width; c < std::min(count, end * width); c += width) {
-                    const int last = std::min(count, c + width);
-                    T* dy = row_of(y.gradient, row);
-                    finish.backward(dy, row_of(y.value, row), row, c, last);
-                    for (int j = c; j < last; ++j) db[j] += dy[j];
-                }
+        const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) {
+            T* dy = row_of(y.gradient, row);
+            finish.backward(dy, row_of(y.value, row), row, 0, count);
+            for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
+        add_column_sums(compute, db, sums, share(y.rows, row_block), count, count);
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
@@ -1106,17 +1119,29 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Finish fin
     return linear(tape, x, affine, 0, affine.bias.columns, finish);
 }
 
-// y [rows.size(), d] = the named rows of x [n, d]; a row may be named once at most.
+// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row, and the gradients back; no list: rows 0, 1, ...
+template <class T>
+void add_named_rows(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows, int count) {
+    const ptrdiff_t d = to.columns;
+    const auto each = [=](auto&& f) {  // f(row of to, row of from)
+        for (ptrdiff_t i = 0; i < count; ++i) f((to_rows ? to_rows[i] : i) * d, (from_rows ? from_rows[i] : i) * d);
+    };
+    each([=](ptrdiff_t a, ptrdiff_t b) {
+        for (ptrdiff_t j = 0; j < d; ++j) to.value[a + j] += from.value[b + j];
+    });
+    tape.on_backward([=] {
+        each([=](ptrdiff_t a, ptrdiff_t b) {
+            for (ptrdiff_t j = 0; j < d; ++j) from.gradient[b + j] += to.gradient[a + j];
+        });
+    });
+}
+
+// The named rows of x [n, d]: [count, d].
 template <class T>
 Tensor<T> select_rows(Tape<T>& tape, Tensor<T> x, const int* rows, int count) {
     const Tensor<T> y = tape.make(count, x.columns);
-    const size_t d = static_cast<size_t>(x.columns);
-    for (int i = 0; i < count; ++i)
-        std::copy_n(x.value + static_cast<size_t>(rows[i]) * d, d, y.value + static_cast<size_t>(i) * d);
-    tape.on_backward([=] {
-        for (size_t i = 0; i < static_cast<size_t>(count); ++i)
-            for (size_t j = 0; j < d; ++j) x.gradient[static_cast<size_t>(rows[i]) * d + j] += y.gradient[i * d + j];
-    });
+    std::fill_n(y.value, y.size(), T(0));
+    add_named_rows(tape, y, nullptr, x, rows, count);
     return y;
 }
 
@@ -1150,30 +1175,23 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
             finish.forward(out, static_cast<int>(row), 0, d);
         }
     });
-    constexpr int block = 64;  // rows whose share of the gradients of weight and bias is added up by itself
-    const int blocks = (x.rows + block - 1) / block;
-    T* sums = tape.template scratch<T>(static_cast<size_t>(tape.recording ? blocks * 2 * d : 0));  // [2, blocks, d]
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward([=, &compute] {
         // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
-        std::fill_n(sums, 2 * blocks * d, T(0));
-        for_rows(compute, blocks, 12 * block * d, [=](int begin, int end) {
-            for (ptrdiff_t row = begin * block; row < std::min(x.rows, end * block); ++row) {
-                const T* n = normalised + row * d;
-                T *dy = y.gradient + row * d, *g = y.value + row * d, *dx = x.gradient + row * d;  // y is done with
-                finish.backward(dy, g, static_cast<int>(row), 0, d);
-                T *d_w = sums + row / block * d, *d_b = d_w + static_cast<ptrdiff_t>(blocks) * d;
-                for (int j = 0; j < d; ++j) {
-                    g[j] = dy[j] * weight.value[j];
-                    d_w[j] += dy[j] * n[j];
-                    d_b[j] += dy[j];
-                }
-                const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
-                for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
+        const T* sums = sums_of_blocks<T>(compute, x.rows, 3 * d, [=](ptrdiff_t row, T* sum) {
+            const T* n = normalised + row * d;
+            T *dy = y.gradient + row * d, *dx = x.gradient + row * d, *g = sum + 2 * d;  // g: no sum, but near
+            finish.backward(dy, y.value + row * d, static_cast<int>(row), 0, d);
+            for (int j = 0; j < d; ++j) {
+                sum[j] += dy[j] * n[j];
+                sum[d + j] += dy[j];
+                g[j] = dy[j] * weight.value[j];
             }
+            const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
+            for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
         });
-        add_column_sums(compute, d_weight, sums, blocks, d);
-        add_column_sums(compute, d_bias, sums + static_cast<ptrdiff_t>(blocks) * d, blocks, d);
+        add_column_sums(compute, d_weight, sums, share(x.rows, row_block), d, 3 * d);
+        add_column_sums(compute, d_bias, sums + d, share(x.rows, row_block), d, 3 * d);
     });
     return y;
 }
@@ -1186,18 +1204,7 @@ struct Dropout {
     uint32_t site;
     float probability;
 
-    // f(first, last, factor) for the elements [begin, end) in chunks [first, last); element i has factor[i - first],
-    // which f may write over.
-    template <class T, class F>
-    void each_chunk(size_t begin, size_t end, F&& f) const {
-        T factor[256];
-        for (size_t first = begin; first < end; first += 256) {
-            const size_t last = std::min(end, first + 256);
-            fill(factor, first, last);
-            f(first, last, factor);
-        }
-    }
-
+    // factor[i - first] of element i, for i in [first, last).
     template <class T>
     void fill(T* factor, size_t first, size_t last) const {
         const T keep = T(1) / (T(1) - T(probability));
@@ -1209,6 +1216,17 @@ struct Dropout {
             const size_t skipped = i % 4, count = std::min(last - i, 64 - skipped);
             for (size_t j = 0; j < count; ++j) factor[i - first + j] = words[skipped + j] < threshold ? T(0) : keep;
             i += count;
+        }
+    }
+
+    // x[i - first] *= the factor of element i, for i in [first, last).
+    template <class T>
+    void apply(T* x, size_t first, size_t last) const {
+        T factor[256];
+        for (size_t i = first; probability != 0 && i < last; i += 256, x += 256) {
+            const size_t count = std::min(last - i, size_t{256});
+            fill(factor, i, i + count);
+            for (size_t j = 0; j < count; ++j) x[j] *= factor[j];
         }
     }
 };
@@ -1228,27 +1246,12 @@ struct DropoutAdd {
 
     DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
     void forward(T* y, int row, int begin, int end) const {
-        each_chunk(row, begin, end, [&](int first, int last, const T* factor) {
-            for (int j = first; j < last; ++j) y[j] *= factor[j - first];
-        });
+        dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(row * d + end));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
     void backward(T* dy, const T*, int row, int begin, int end) const {
         for (int j = begin; residual.value && j < end; ++j) residual.gradient[row * d + j] += dy[j];
-        each_chunk(row, begin, end, [&](int first, int last, const T* factor) {
-            for (int j = first; j < last; ++j) dy[j] *= factor[j - first];
-        });
-    }
-
-  private:
-    template <class F>
-    void each_chunk(int row, int begin, int end, F&& f) const {
-        if (dropout.probability == 0) return;
-        const size_t start = static_cast<size_t>(row * d);
-        dropout.each_chunk<T>(start + static_cast<size_t>(begin), start + static_cast<size_t>(end),
-                              [&](size_t first, size_t last, const T* factor) {
-                                  f(static_cast<int>(first - start), static_cast<int>(last - start), factor);
-                              });
+        dropout.apply(dy + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(row * d + end));
     }
 };
 
@@ -1278,21 +1281,32 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// What attention does with n rows [size] that lie `stride` apart: y_j = scale (x . row_j);  to += sum_j weight_j row_j;
-// row_j += weight_j x.
+// to += sum_j weight_j row_j, columns [first, first + 16 Vectors), held in registers.
+template <int Vectors, class T>
+ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride,
+                               int n) {
+    typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
+    typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
+    Lanes sum[Vectors];
+    for (int v = 0; v < Vectors; ++v) sum[v] = *reinterpret_cast<const Unaligned*>(to + 16 * v);
+    for (int j = 0; j < n; ++j)
+        for (int v = 0; v < Vectors; ++v)
+            sum[v] += weight[j * weight_stride] * *reinterpret_cast<const Unaligned*>(rows + j * stride + 16 * v);
+    for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Unaligned*>(to + 16 * v) = sum[v];
+}
+
+// What attention does with n rows [size] that lie `stride` apart: y_j = scale (x . row_j), and the sum above.
 #define ATTENTION_ROWS(TARGET, T)                                                                                     \
     TARGET inline void dot_rows(T* y, const T* x, const T* rows, ptrdiff_t stride, int n, int size, T scale) {        \
         for (int j = 0; j < n; ++j) y[j] = dot(x, rows + j * stride, size) * scale;                                   \
     }                                                                                                                 \
-    TARGET inline void add_rows(T* __restrict to, const T* weight, const T* __restrict rows, ptrdiff_t stride, int n, \
-                                int size) {                                                                           \
+    TARGET inline void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows, \
+                                ptrdiff_t stride, int n, int size) {                                                  \
+        int c = 0;                                                                                                    \
+        for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, stride, n);         \
+        for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, stride, n);           \
         for (int j = 0; j < n; ++j)                                                                                   \
-            for (int c = 0; c < size; ++c) to[c] += weight[j] * rows[j * stride + c];                                 \
-    }                                                                                                                 \
-    TARGET inline void add_to_rows(T* __restrict rows, const T* weight, const T* __restrict x, ptrdiff_t stride,      \
-                                   int n, int size) {                                                                 \
-        for (int j = 0; j < n; ++j)                                                                                   \
-            for (int c = 0; c < size; ++c) rows[j * stride + c] += weight[j] * x[c];                                  \
+            for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * stride + i];                 \
     }
 ATTENTION_ROWS(EACH_TARGET, float)
 ATTENTION_ROWS(, double)
@@ -1317,60 +1331,55 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     const Tensor<T> out = tape.make(q.rows, d);
     int longest = 1;
     for (int s = 0; s < span_count; ++s) longest = std::max(longest, spans[s].tokens);
-    const size_t row = static_cast<size_t>(longest);
-    T* weights = tape.template scratch<T>(static_cast<size_t>(q.rows * heads) * row);  // [queries, heads, longest]
+    const ptrdiff_t row = longest, rows = static_cast<ptrdiff_t>(heads) * row;  // from a query's weights to the next's
+    const size_t all = static_cast<size_t>(q.rows * rows);
+    T *weights = tape.template scratch<T>(all),  // [queries, heads, longest]
+        *d_weights = tape.template scratch<T>(tape.recording ? all : 0),
+      *factors = tape.template scratch<T>(static_cast<size_t>(span_count * row));  // [spans, longest] dropout's
     Compute& compute = tape.compute;
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
-    for_rows(compute, span_count, work, [=](int begin, int end) {
-        for (int s = begin; s < end; ++s)
-            for (int i = spans[s].first_query; i < spans[s].first_query + spans[s].queries; ++i)
-                for (int h = 0; h < heads; ++h) {
-                    const int seen = position[i] - spans[s].first_token + 1;
-                    const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
-                    T *w = weights + first_weight, *o = out.value + static_cast<ptrdiff_t>(i) * d + h * size;
-                    const T* query = q.value + static_cast<ptrdiff_t>(i) * d + h * size;
-                    const T *key = kv.value + spans[s].first_token * stride + h * size, *v = key + d;
-                    dot_rows(w, query, key, stride, seen, size, scale);
-                    softmax(w, seen);
-                    std::fill_n(o, size, T(0));
-                    dropout.each_chunk<T>(first_weight, first_weight + static_cast<size_t>(seen),
-                                          [=](size_t first, size_t last, T* factor) {
-                                              const ptrdiff_t j = static_cast<ptrdiff_t>(first - first_weight);
-                                              const int count = static_cast<int>(last - first);
-                                              for (ptrdiff_t k = 0; k < count; ++k) factor[k] *= w[j + k];
-                                              add_rows(o, factor, v + j * stride, stride, count, size);
-                                          });
-                }
-    });
-    T* d_weights = tape.template scratch<T>(tape.recording ? static_cast<size_t>(q.rows * heads) * row : 0);
-    tape.on_backward([=, &compute] {
-        for_rows(compute, span_count, 2 * work, [=](int begin, int end) {
+    const auto each_head = [=, &compute](int cost, auto&& f) {  // f(span, its factors, head)
+        for_rows(compute, span_count, cost, [=](int begin, int end) {
             for (int s = begin; s < end; ++s)
-                for (int i = spans[s].first_query; i < spans[s].first_query + spans[s].queries; ++i)
-                    for (int h = 0; h < heads; ++h) {
-                        const int seen = position[i] - spans[s].first_token + 1;
-                        const size_t first_weight = static_cast<size_t>(i * heads + h) * row;
-                        const ptrdiff_t at = static_cast<ptrdiff_t>(i) * d + h * size;
-                        const ptrdiff_t first_key = spans[s].first_token * stride + h * size;
-                        const T *w = weights + first_weight, *query = q.value + at, *d_out = out.gradient + at;
-                        T *dw = d_weights + first_weight, *d_query = q.gradient + at;
-                        // d_v_j += factor_j w_j d_out;  dw_j = factor_j v_j . d_out
-                        dropout.each_chunk<T>(first_weight, first_weight + static_cast<size_t>(seen),
-                                              [=](size_t first, size_t last, T* factor) {
-                                                  const ptrdiff_t j = static_cast<ptrdiff_t>(first - first_weight),
-                                                                  value = first_key + j * stride + d;
-                                                  const int count = static_cast<int>(last - first);
-                                                  dot_rows(dw + j, d_out, kv.value + value, stride, count, size, T(1));
-                                                  for (ptrdiff_t k = 0; k < count; ++k)
-                                                      dw[j + k] *= factor[k], factor[k] *= w[j + k];
-                                                  add_to_rows(kv.gradient + value, factor, d_out, stride, count, size);
-                                              });
-                        // Through the softmax: d_score_j = w_j (dw_j - sum_m w_m dw_m).
-                        const T mean = dot(w, dw, seen);
-                        for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
-                        add_rows(d_query, dw, kv.value + first_key, stride, seen, size);
-                        add_to_rows(kv.gradient + first_key, dw, query, stride, seen, size);
-                    }
+                for (int h = 0; h < heads; ++h) f(spans[s], factors + s * row, h);
+        });
+    };
+    const auto seen_by = [=](ptrdiff_t i, const Span& span) { return position[i] - span.first_token + 1; };
+    each_head(work, [=](const Span& span, T* factor, int h) {
+        for (ptrdiff_t i = span.first_query; i < span.first_query + span.queries; ++i) {
+            const int seen = seen_by(i, span);
+            const T *key = kv.value + span.first_token * stride + h * size, *v = key + d;
+            T *w = weights + i * rows + h * row, *o = out.value + i * d + h * size;
+            dot_rows(w, q.value + i * d + h * size, key, stride, seen, size, scale);
+            softmax(w, seen);
+            dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(w - weights + seen));
+            for (int j = 0; j < seen; ++j) factor[j] *= w[j];
+            std::fill_n(o, size, T(0));
+            add_rows(o, factor, 1, v, stride, seen, size);
+        }
+    });
+    tape.on_backward([=] {
+        each_head(2 * work, [=](const Span& span, T* factor, int h) {
+            const ptrdiff_t first_key = span.first_token * stride + h * size, last = span.first_query + span.queries;
+            for (ptrdiff_t i = span.first_query; i < last; ++i) {
+                const int seen = seen_by(i, span);
+                T *w = weights + i * rows + h * row, *dw = d_weights + i * rows + h * row;
+                // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
+                dot_rows(dw, out.gradient + i * d + h * size, kv.value + first_key + d, stride, seen, size, T(1));
+                dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(w - weights + seen));
+                for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
+                const T mean = dot(w, dw, seen);
+                for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale, w[j] *= factor[j];
+                add_rows(q.gradient + i * d + h * size, dw, 1, kv.value + first_key, stride, seen, size);
+            }
+            // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
+            for (ptrdiff_t j = 0, i = span.first_query; j < span.tokens; ++j) {
+                while (i < last && seen_by(i, span) <= j) ++i;
+                const ptrdiff_t weight = i * rows + h * row + j, at = i * d + h * size;
+                T* d_key = kv.gradient + first_key + j * stride;
+                add_rows(d_key, d_weights + weight, rows, q.value + at, d, static_cast<int>(last - i), size);
+                add_rows(d_key + d, weights + weight, rows, out.gradient + at, d, static_cast<int>(last - i), size);
+            }
         });
     });
     return out;
@@ -1586,55 +1595,43 @@ const Element* keep(Tape<T>& tape, const std::vector<Element>& x) {
         std::memcpy(tape.template scratch<Element>(x.size() + 1), x.data(), x.size() * sizeof(Element)));
 }
 
-// to[rows[i]] = from[i] + table[index[i]] for each i; both ways. An empty table adds nothing.
-template <class T>
-void place_tokens(Tape<T>& tape, Tensor<T> to, const std::vector<int>& rows, Tensor<T> from, Tensor<T> table,
-                  const std::vector<int>& index) {
-    const int *row = keep(tape, rows), *at = keep(tape, index);
-    const ptrdiff_t d = to.columns;
-    for (ptrdiff_t i = 0; i < from.rows; ++i)
-        for (ptrdiff_t j = 0; j < d; ++j)
-            to.value[row[i] * d + j] = from.value[i * d + j] + (table.value ? table.value[at[i] * d + j] : T(0));
-    T* d_table = table.value ? tape.gradient(table) : nullptr;
-    tape.on_backward([=] {
-        for (ptrdiff_t i = 0; i < from.rows; ++i)
-            for (ptrdiff_t j = 0; j < d; ++j) {
-                from.gradient[i * d + j] += to.gradient[row[i] * d + j];
-                if (table.value) d_table[at[i] * d + j] += to.gradient[row[i] * d + j];
-            }
-    });
-}
-
 // The tokens R, s, a of every step, each through its own linear layer, plus the position's row: [tokens, width].
 template <class T>
 Tensor<T> embed_tokens(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch,
                        const TokenLayout& layout) {
     const TransformerConfig& config = model.config;
-    const int n = batch.steps();
+    const int A = config.action_dim;
     const Tensor<T> tokens = tape.make(layout.tokens, config.width);
-    std::vector<int> rows = layout.step_token, position(static_cast<size_t>(n), 0);
-    for (size_t i = 0; config.max_timesteps > 0 && i < position.size(); ++i)
-        position[i] = std::min(batch.timesteps[i], config.max_timesteps - 1);  // ODT clips at the end of its table
-    place_tokens(tape, tokens, rows, linear(tape, tape.constant(batch.returns_to_go.data(), n, 1), model.embed_return),
-                 model.embed_ordering, position);
-    for (int& row : rows) ++row;
-    place_tokens(tape, tokens, rows,
-                 linear(tape, tape.constant(batch.states.data(), n, config.state_dim), model.embed_state),
-                 model.embed_ordering, position);
-    std::vector<int> action_rows, action_position;
+    std::fill_n(tokens.value, tokens.size(), T(0));
+    Tensor<T> positions = model.embed_ordering;
+    positions.gradient = tape.gradient(positions);
+    // The tokens of the named steps, `offset` after their R: inputs of each through the layer, plus the position's row.
+    const auto place = [&](const std::vector<size_t>& steps, int offset, const auto& inputs, int columns,
+                           const Affine<T>& layer) {
+        const int count = static_cast<int>(steps.size());
+        if (count == 0) return;
+        std::vector<int> rows, timesteps;
+        for (const size_t step : steps) {
+            rows.push_back(layout.step_token[step] + offset);
+            timesteps.push_back(std::min(batch.timesteps[step], config.max_timesteps - 1));  // ODT clips at the end
+        }
+        const int* kept = keep(tape, rows);
+        const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
+        add_named_rows(tape, tokens, kept, embedded, nullptr, count);
+        if (config.max_timesteps > 0) add_named_rows(tape, tokens, kept, positions, keep(tape, timesteps), count);
+    };
+    std::vector<size_t> all(batch.returns_to_go.size()), acted;  // steps: all, and those whose action is a token
+    std::iota(all.begin(), all.end(), size_t{0});
     std::vector<float> actions;
     for (size_t window = 0, step = 0; window < batch.lengths.size(); ++window, ++step)
         for (int c = 0; c + 1 < batch.lengths[window]; ++c, ++step) {
-            const auto first = batch.actions.begin() + static_cast<ptrdiff_t>(step) * config.action_dim;
-            actions.insert(actions.end(), first, first + config.action_dim);
-            action_rows.push_back(rows[step] + 1);
-            action_position.push_back(position[step]);
+            acted.push_back(step);
+            const auto first = batch.actions.begin() + static_cast<ptrdiff_t>(step) * A;
+            actions.insert(actions.end(), first, first + A);
         }
-    const int action_count = static_cast<int>(action_rows.size());
-    if (action_count > 0)
-        place_tokens(tape, tokens, action_rows,
-                     linear(tape, tape.constant(actions.data(), action_count, config.action_dim), model.embed_action),
-                     model.embed_ordering, action_position);
+    place(all, 0, batch.returns_to_go, 1, model.embed_return);
+    place(all, 1, batch.states, config.state_dim, model.embed_state);
+    place(acted, 2, actions, A, model.embed_action);
     return tokens;
 }
 
@@ -1665,28 +1662,30 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
     return tape.show(name, linear(tape, hidden, block.mlp_proj, add_x1));
 }
 
-// y = -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
-template <class T>
-Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
+// f(x) of each element; slope(x, y) is the derivative there.
+template <class T, class F, class Slope>
+Tensor<T> map(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
     const Tensor<T> y = tape.make(x.rows, x.columns);
-    for (size_t i = 0; i < x.size(); ++i) y.value[i] = T(-5) + T(3.5) * (std::tanh(x.value[i]) + T(1));
+    for (size_t i = 0; i < x.size(); ++i) y.value[i] = f(x.value[i]);
     tape.on_backward([=] {
-        for (size_t i = 0; i < x.size(); ++i) {
-            const T t = std::tanh(x.value[i]);
-            x.gradient[i] += T(3.5) * (T(1) - t * t) * y.gradient[i];
-        }
+        for (size_t i = 0; i < x.size(); ++i) x.gradient[i] += slope(x.value[i], y.value[i]) * y.gradient[i];
     });
     return y;
 }
 
+// -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
+template <class T>
+Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
+    const auto slope = [](T t) { return T(3.5) * (T(1) - t * t); };
+    return map(
+        tape, x, [](T u) { return T(-5) + T(3.5) * (std::tanh(u) + T(1)); },
+        [=](T u, T) { return slope(std::tanh(u)); });
+}
+
 template <class T>
 Tensor<T> tanh_of(Tape<T>& tape, Tensor<T> x) {
-    const Tensor<T> y = tape.make(x.rows, x.columns);
-    for (size_t i = 0; i < x.size(); ++i) y.value[i] = std::tanh(x.value[i]);
-    tape.on_backward([=] {
-        for (size_t i = 0; i < x.size(); ++i) x.gradient[i] += (T(1) - y.value[i] * y.value[i]) * y.gradient[i];
-    });
-    return y;
+    return map(
+        tape, x, [](T u) { return std::tanh(u); }, [](T, T y) { return T(1) - y * y; });
 }
 
 // log of the softmax of each row of the logits, [n, moves].
@@ -1752,113 +1751,92 @@ T log_tanh_slope(T u) {
 
 constexpr double half_log_2_pi = 0.91893853320467274;
 
+// The sum of each row of [rows, columns] elements, [rows, 1], in order: of value(i) for element i; slope(i, dy) passes
+// the gradient of its row's sum on.
+template <class T, class Value, class Slope>
+Tensor<T> row_sums(Tape<T>& tape, int rows, int columns, Value value, Slope slope) {
+    const Tensor<T> y = tape.make(rows, 1);
+    std::fill_n(y.value, rows, T(0));
+    const ptrdiff_t n = static_cast<ptrdiff_t>(rows) * columns;
+    for (ptrdiff_t i = 0; i < n; ++i) y.value[i / columns] += value(i);
+    tape.on_backward([=] {
+        for (ptrdiff_t i = 0; i < n; ++i) slope(i, y.gradient[i / columns]);
+    });
+    return y;
+}
+
 // log pi(a) of a = tanh(u), u ~ N(mean, exp(log_std)^2), summed over the action's dimensions: with u = atanh(a),
 // sum of -((u - mean) / std)^2 / 2 - log_std - log(2 pi) / 2 - log(1 - a^2). actions [n, A], strictly inside (-1, 1).
 template <class T>
 Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* actions) {
-    const Tensor<T> mean = policy.mean, log_std = policy.log_std, y = tape.make(mean.rows, 1);
+    const Tensor<T> mean = policy.mean, log_std = policy.log_std;
     const Tensor<T> a = tape.constant(actions, mean.rows, mean.columns);
-    const size_t columns = static_cast<size_t>(mean.columns);
-    const auto standardised = [=](size_t i) {
+    const auto standardised = [=](ptrdiff_t i) {
         return (std::atanh(a.value[i]) - mean.value[i]) / std::exp(log_std.value[i]);
     };
-    for (size_t i = 0; i < a.size(); ++i) {
-        if (i % columns == 0) y.value[i / columns] = 0;
+    const auto value = [=](ptrdiff_t i) {
         const T z = standardised(i);
-        y.value[i / columns] +=
-            T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(std::atanh(a.value[i]));
-    }
-    tape.on_backward([=] {
-        for (size_t i = 0; i < a.size(); ++i) {
-            const T z = standardised(i), dy = y.gradient[i / columns];
-            mean.gradient[i] += dy * z / std::exp(log_std.value[i]);
-            log_std.gradient[i] += dy * (z * z - T(1));
-        }
+        return T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(std::atanh(a.value[i]));
+    };
+    return row_sums(tape, a.rows, a.columns, value, [=](ptrdiff_t i, T dy) {
+        const T z = standardised(i);
+        mean.gradient[i] += dy * z / std::exp(log_std.value[i]);
+        log_std.gradient[i] += dy * (z * z - T(1));
     });
-    return y;
 }
 
 // One-sample estimate of the entropy, -log pi(tanh(u)) with u = mean + exp(log_std) noise; noise [n, A] standard
 // normal. The gradient flows through the sample, as ODT's does: the Gaussian term is then noise^2 / 2, a constant.
 template <class T>
 Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) {
-    const Tensor<T> mean = policy.mean, log_std = policy.log_std, y = tape.make(mean.rows, 1);
+    const Tensor<T> mean = policy.mean, log_std = policy.log_std;
     const Tensor<T> n = tape.constant(noise, mean.rows, mean.columns);
-    const size_t columns = static_cast<size_t>(mean.columns);
-    const auto sample = [=](size_t i) { return mean.value[i] + std::exp(log_std.value[i]) * n.value[i]; };
-    for (size_t i = 0; i < n.size(); ++i) {
-        if (i % columns == 0) y.value[i / columns] = 0;
-        y.value[i / columns] +=
-            T(0.5) * n.value[i] * n.value[i] + log_std.value[i] + T(half_log_2_pi) + log_tanh_slope(sample(i));
-    }
-    tape.on_backward([=] {
-        for (size_t i = 0; i < n.size(); ++i) {  // d log_tanh_slope(u) / du = -2 tanh(u)
-            const T slope = T(-2) * std::tanh(sample(i)), dy = y.gradient[i / columns];
-            mean.gradient[i] += dy * slope;
-            log_std.gradient[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
-        }
+    const auto sample = [=](ptrdiff_t i) { return mean.value[i] + std::exp(log_std.value[i]) * n.value[i]; };
+    const auto value = [=](ptrdiff_t i) {
+        return T(0.5) * n.value[i] * n.value[i] + log_std.value[i] + T(half_log_2_pi) + log_tanh_slope(sample(i));
+    };
+    return row_sums(tape, n.rows, n.columns, value, [=](ptrdiff_t i, T dy) {
+        const T slope = T(-2) * std::tanh(sample(i));  // of log_tanh_slope
+        mean.gradient[i] += dy * slope;
+        log_std.gradient[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
     });
-    return y;
 }
 
 // log pi(a): the entry of each row that the action names. actions [n, 1], whole numbers.
 template <class T>
 Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* actions) {
-    const Tensor<T> y = tape.make(log_p.rows, 1), a = tape.constant(actions, log_p.rows, 1);
+    const Tensor<T> a = tape.constant(actions, log_p.rows, 1);
     const auto named = [=](ptrdiff_t row) { return row * log_p.columns + static_cast<ptrdiff_t>(a.value[row]); };
-    for (ptrdiff_t row = 0; row < y.rows; ++row) y.value[row] = log_p.value[named(row)];
-    tape.on_backward([=] {
-        for (ptrdiff_t row = 0; row < y.rows; ++row) log_p.gradient[named(row)] += y.gradient[row];
-    });
-    return y;
+    return row_sums(
+        tape, a.rows, 1, [=](ptrdiff_t row) { return log_p.value[named(row)]; },
+        [=](ptrdiff_t row, T dy) { log_p.gradient[named(row)] += dy; });
 }
 
 // H = -sum p log p, exact.
 template <class T>
 Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
-    const Tensor<T> y = tape.make(log_p.rows, 1);
-    const ptrdiff_t moves = log_p.columns;
-    for (ptrdiff_t row = 0; row < y.rows; ++row) {
-        y.value[row] = 0;
-        for (ptrdiff_t j = row * moves; j < (row + 1) * moves; ++j)
-            y.value[row] -= std::exp(log_p.value[j]) * log_p.value[j];
-    }
-    tape.on_backward([=] {
-        for (ptrdiff_t j = 0; j < y.rows * moves; ++j)
-            log_p.gradient[j] -= y.gradient[j / moves] * std::exp(log_p.value[j]) * (log_p.value[j] + T(1));
-    });
-    return y;
+    return row_sums(
+        tape, log_p.rows, log_p.columns, [=](ptrdiff_t i) { return -std::exp(log_p.value[i]) * log_p.value[i]; },
+        [=](ptrdiff_t i, T dy) { log_p.gradient[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
 // DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions.
 template <class T>
 Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* actions) {
-    const Tensor<T> y = tape.make(prediction.rows, 1), a = tape.constant(actions, prediction.rows, prediction.columns);
-    const ptrdiff_t columns = prediction.columns;
-    for (ptrdiff_t row = 0; row < y.rows; ++row) {
-        y.value[row] = 0;
-        for (ptrdiff_t j = row * columns; j < (row + 1) * columns; ++j) {
-            const T error = prediction.value[j] - a.value[j];
-            y.value[row] += error * error / T(columns);
-        }
-    }
-    tape.on_backward([=] {
-        for (ptrdiff_t j = 0; j < y.rows * columns; ++j)
-            prediction.gradient[j] += y.gradient[j / columns] * T(2) * (prediction.value[j] - a.value[j]) / T(columns);
-    });
-    return y;
+    const Tensor<T> a = tape.constant(actions, prediction.rows, prediction.columns);
+    const auto error = [=](ptrdiff_t i) { return prediction.value[i] - a.value[i]; };
+    return row_sums(
+        tape, a.rows, a.columns, [=](ptrdiff_t i) { return error(i) * error(i) / T(a.columns); },
+        [=](ptrdiff_t i, T dy) { prediction.gradient[i] += dy * T(2) * error(i) / T(a.columns); });
 }
 
 // sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
 template <class T, class Number>
 Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
-    const Tensor<T> y = tape.make(1, 1), c = tape.constant(coefficients, x.rows, 1);
-    y.value[0] = 0;
-    for (int i = 0; i < x.rows; ++i) y.value[0] += c.value[i] * x.value[i];
-    tape.on_backward([=] {
-        for (int i = 0; i < x.rows; ++i) x.gradient[i] += c.value[i] * y.gradient[0];
-    });
-    return y;
+    const Tensor<T> c = tape.constant(coefficients, x.rows, 1);
+    return row_sums(
+        tape, 1, x.rows, [=](ptrdiff_t i) { return c.value[i] * x.value[i]; },
+        [=](ptrdiff_t i, T dy) { x.gradient[i] += c.value[i] * dy; });
 }
 
 // a x + b y, [1, 1].
@@ -1958,29 +1936,22 @@ EACH_TARGET inline bool apply_step(float* __restrict value, float* __restrict gr
     return !bad;
 }
 
-// Adds the gradients of all blocks, in order, to the first, and empties the others.
+// Adds the gradients of all blocks, in order, to the first, empties the others, and returns the norm of all. Errors:
+// nn.not_finite names the tensor.
 template <class T>
-void join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
-    for (Parameter<T>& parameter : parameters) {
-        const int n = static_cast<int>(parameter.value.size()),
-                  blocks = static_cast<int>(parameter.gradient.size()) / n;
-        if (blocks == 1) continue;
-        T* gradient = parameter.gradient.data();
-        add_column_sums(compute, gradient, gradient + n, blocks - 1, n);
-        std::fill(parameter.gradient.begin() + n, parameter.gradient.end(), T(0));
-    }
-}
-
-// Norm of all gradients. Errors: nn.not_finite names the tensor.
-template <class T>
-double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
+double join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
     double total = 0;
     std::vector<double> sums;
-    for (const Parameter<T>& parameter : parameters) {
+    for (Parameter<T>& parameter : parameters) {
         const size_t n = parameter.value.size();
         sums.assign((n + square_block - 1) / square_block, 0);
         for_blocks(compute, n, square_block, [&](size_t block, size_t first, size_t count) {
-            sums[block] = block_of_squares(parameter.gradient.data() + first, count);
+            T* const gradient = parameter.gradient.data() + first;
+            for (size_t other = n; other < parameter.gradient.size(); other += n) {
+                for (size_t i = 0; i < count; ++i) gradient[i] += gradient[other + i];
+                std::fill_n(gradient + other, count, T(0));
+            }
+            sums[block] = block_of_squares(gradient, count);
         });
         const double squares = std::accumulate(sums.begin(), sums.end(), 0.0);
         if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
@@ -1995,8 +1966,7 @@ double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& paramete
 // (gradient), or after (value).
 inline double update_parameters(Compute& compute, std::vector<Parameter<float>>& parameters, Optimizer& optimizer,
                                 const OptimizerConfig& config) {
-    join_gradients(compute, parameters);
-    const double norm = gradient_norm(compute, parameters);
+    const double norm = join_gradients(compute, parameters);
     // PyTorch's clip_grad_norm_: scale by limit / (norm + 1e-6) where that is below 1.
     const double scale = config.clip_norm > 0 ? std::min(1.0, config.clip_norm / (norm + 1e-6)) : 1.0;
     const double learning_rate = config.learning_rate * warmup_factor(optimizer.updates, config.warmup_updates);

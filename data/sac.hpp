@@ -147,7 +147,7 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
             matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, Store::accumulate);
         // dW += dy^T x
         matmul(compute, View<T>{w.gradient, in}, dy_turned, {x.value, in}, out, in, x.rows, Store::accumulate);
-        add_column_sums(compute, b.gradient, y.gradient, y.rows, out);
+        add_column_sums(compute, b.gradient, y.gradient, y.rows, out, out);
     });
     return y;
 }

@@ -392,24 +392,22 @@ TEST(products_that_are_not_finite_stay_so_in_every_precision) {
         }
 }
 
-TEST(every_part_of_a_product_is_prepared_and_finished_once) {
+TEST(every_part_of_a_product_is_finished_once_after_its_last_addition) {
     constexpr int M = 101, N = 70, K = 600;
     Draws draws = {5};
     const std::vector<float> a = draws.normals<float>(M * K), b = draws.normals<float>(K * N);
     for (const Kernel* kernel : kernels_of_this_machine())
         for (const int threads : {1, 3}) {
             Compute compute(*kernel, threads);
-            std::vector<float> plain(M * N, 2.0f), c(M * N);
+            std::vector<float> plain(M * N, 2.0f), c(M * N, 2.0f);
             matmul(compute, View<float>{plain.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate);
             const auto each = [&](const Block& block, auto&& f) {
                 for (int i = block.first_row; i < block.end_row; ++i)
                     for (int j = block.first_column; j < block.end_column; ++j) f(c[static_cast<size_t>(i * N + j)]);
             };
-            matmul(
-                compute, View<float>{c.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate,
-                [&](const Block& block) { each(block, [](float& x) { x += 2; }); },
-                [&](const Block& block) { each(block, [](float& x) { x *= -0.5f; }); });
-            for (float& x : plain) x *= -0.5f;
+            matmul(compute, View<float>{c.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate,
+                   [&](const Block& block) { each(block, [](float& x) { x = -0.5f * x + 1; }); });
+            for (float& x : plain) x = -0.5f * x + 1;
             CHECK(same_bits(c, plain));
         }
 }
@@ -592,11 +590,13 @@ TEST(gradients_of_small_operations_equal_central_differences) {
                     {&x, &norm_w, &norm_b});
     gradients.check("tanh_of", [&](auto& t) { return tanh_of(t, x.tensor()); }, {&x});
     gradients.check("squash_log_std", [&](auto& t) { return squash_log_std(t, x.tensor()); }, {&x});
-    gradients.check("place_tokens",
+    gradients.check("add_named_rows",
                     [&](auto& t) {
                         const Tensor<double> to = t.make(7, 3);
                         std::fill_n(to.value, to.size(), 0.0);
-                        return place_tokens(t, to, places, x.tensor(), table.tensor(), index), to;
+                        add_named_rows(t, to, places.data(), x.tensor(), nullptr, x.tensor().rows);
+                        add_named_rows(t, to, places.data(), table.tensor(), index.data(), x.tensor().rows);
+                        return to;
                     },
                     {&x, &table});
     gradients.check("weighted_sum", [&](auto& t) { return weighted_sum(t, column.tensor(), weights.data()); },
@@ -1375,16 +1375,13 @@ TEST(dropout_keeps_its_share_and_scales_it_up) {
 TEST(dropout_in_pieces_equals_dropout_of_the_whole) {
     const Dropout dropout = {{test_seed(), Stream::dropout}, 1, 2, 0.5f};
     const size_t n = 700;  // more than a chunk
-    std::vector<double> whole(n), pieces(n);
-    const auto add_to = [](std::vector<double>& to) {
-        return [&to](size_t first, size_t last, const double* factor) {
-            for (size_t i = first; i < last; ++i) to[i] += factor[i - first];
-        };
-    };
-    dropout.each_chunk<double>(0, n, add_to(whole));
-    for (size_t begin = 0; begin < n; begin += 7)
-        dropout.each_chunk<double>(begin, std::min(n, begin + 7), add_to(pieces));
-    CHECK(same_bits(whole, pieces));
+    std::vector<double> whole(n), pieces(n, 3), filled(n);
+    dropout.fill(whole.data(), 0, n);
+    for (size_t begin = 0; begin < n; begin += 7) dropout.fill(&filled[begin], begin, std::min(n, begin + 7));
+    CHECK(same_bits(filled, whole));
+    for (size_t begin = 0; begin < n; begin += 350) dropout.apply(&pieces[begin], begin, begin + 350);
+    for (double& x : whole) x *= 3;
+    CHECK(same_bits(pieces, whole));
 }
 
 TEST(dropout_places_of_a_network_are_all_different) {
