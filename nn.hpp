@@ -379,7 +379,7 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
                              int columns, bool add) {
     typedef Vector Unaligned __attribute__((aligned(4), may_alias));
     constexpr int lanes = sizeof(Vector) / sizeof(float), tile_columns = lanes * Vectors;
-    for (int r = 0; r < rows; ++r)  // C is far away, and wanted only at the end
+    for (int r = 0; r < rows; ++r)  // C may be far away, and is wanted only at the end
         for (int j = 0; j < columns; j += 16) __builtin_prefetch(c + static_cast<ptrdiff_t>(r) * c_stride + j, 1);
     Vector sum[Rows][Vectors] = {};
     for (int k = 0; k < depth; ++k) {
@@ -709,18 +709,16 @@ inline const Kernel& choose_kernel(const std::string& name, const std::string& p
          precision.c_str(), name.c_str(), available.c_str());
 }
 
-// Scratch memory on cache lines: a vector load that straddles two lines costs two.
-struct alignas(64) Line {
-    char bytes[64];
-};
-inline size_t lines_for(size_t bytes) { return (bytes + 63) / 64; }
-
-// Scratch memory that grows to what was once asked for.
+// Scratch memory on cache lines (a vector load that straddles two costs two), grown to what was once asked for. What is
+// in it lasts until room() is called again.
 struct Buffer {
+    struct alignas(64) Line {
+        char bytes[64];
+    };
     std::vector<Line> lines;
     char* room(size_t bytes) {
-        if (lines.size() < lines_for(bytes)) lines.resize(lines_for(bytes));
-        return lines[0].bytes;
+        if (lines.size() * sizeof(Line) < bytes) lines.resize((bytes + 63) / 64);
+        return reinterpret_cast<char*>(lines.data());
     }
 };
 
@@ -739,13 +737,14 @@ struct Compute {
           packed_a(static_cast<size_t>(thread_count)) {}
 };
 
-inline int share(int n, int parts) { return (n + parts - 1) / parts; }  // rounded up
+inline int divide_up(int n, int by) { return (n + by - 1) / by; }
+
 // Rows and columns of C that a task works on.
 struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
-// The product of a block of rows with panels of B, for one stretch of k.
+// The product of a block of rows with panels of B, for one step of k.
 inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a, View<const float> b,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
     char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, kernel.depth()));
@@ -770,15 +769,6 @@ inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, V
     kernel.prepare(false);
 }
 
-// Packs the panels [first, end) of B for one stretch of k, side by side.
-inline void pack_panels(const Kernel& kernel, char* packed_b, View<const float> b, int first, int end, int N,
-                        int first_k, int depth) {
-    const int width = kernel.tile_columns;
-    for (int p = first; p < end; ++p)
-        kernel.pack_b(packed_b + static_cast<size_t>(p) * kernel.panel_bytes(width, depth), b, first_k, p * width,
-                      depth, std::min(width, N - p * width));
-}
-
 struct Nothing {
     void operator()(const Block&) const {}
 };
@@ -798,26 +788,29 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     const bool pack_b = kernel.parts > 0 || M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
-    const int tiles = share(M, kernel.tile_rows), panels = share(N, kernel.tile_columns);
-    const int row_blocks = std::max(share(tiles, Compute::block_rows / kernel.tile_rows), std::min(tiles, 4));
+    const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
+    const int row_blocks = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), std::min(tiles, 4));
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels.
     const int depth = kernel.depth();
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
-    const int steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, share(K, depth));
+    const int steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, divide_up(K, depth));
     char* const packed = pack_b ? compute.packed_b.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
     const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
+    const auto panel_bytes = [&](int k) { return kernel.panel_bytes(kernel.tile_columns, k); };
     for (int first_k = 0; first_k < K; first_k += steps * depth) {
         const int end_k = std::min(K, first_k + steps * depth);
         const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
-        const int batch = std::max(1, panels / 8);  // panels that a task packs
+        const int at_once = std::max(1, panels / 8), batches = divide_up(panels, at_once);  // panels that a task packs
         if (pack_b)
             compute.threads.run(
-                share(end_k - first_k, depth) * share(panels, batch),
+                divide_up(end_k - first_k, depth) * batches,
                 [&](int task, int) {
-                    const int step = task / share(panels, batch), first = task % share(panels, batch) * batch;
-                    const int k = first_k + step * depth;
-                    pack_panels(kernel, packed_b(step), b, first, std::min(panels, first + batch), N, k, depth_at(k));
+                    const int step = task / batches, first = task % batches * at_once, k = first_k + step * depth;
+                    char* to = packed_b(step) + static_cast<size_t>(first) * panel_bytes(depth_at(k));
+                    for (int p = first; p < std::min(panels, first + at_once); ++p, to += panel_bytes(depth_at(k)))
+                        kernel.pack_b(to, b, k, p * kernel.tile_columns, depth_at(k),
+                                      std::min(kernel.tile_columns, N - p * kernel.tile_columns));
                 },
                 serial);
         compute.threads.run(
@@ -934,8 +927,7 @@ struct Tape {
     size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: a fresh mask for each
-    // Told of each layer's output as soon as it is there (its memory may serve otherwise in backward()). Empty: no one
-    // watches.
+    // Told of each layer's output as soon as it is there. Empty: no one watches.
     std::function<void(const std::string& name, const Tensor<T>& output)> watch;
 
     explicit Tape(Compute& c) : compute(c) {}
@@ -1007,33 +999,33 @@ struct Tape {
 // row.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int block = std::max(1, std::min(share(rows, 8), 1 + 100000 / std::max(1, work)));
+    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
     const bool serial = static_cast<double>(rows) * work < 2e4;
     compute.threads.run(
-        share(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
+        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
 }
 
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>
 void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns, ptrdiff_t stride) {
-    for_rows(compute, share(columns, 64), rows * 64, [=](int begin, int end) {
+    for_rows(compute, divide_up(columns, 64), rows * 64, [=](int begin, int end) {
         for (int row = 0; row < rows; ++row)
             for (int j = begin * 64; j < std::min(columns, end * 64); ++j) to[j] += from[row * stride + j];
     });
 }
 
 // Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its block
-// of row_block rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the next call.
-constexpr int row_block = 64;
+// of rows_a_sum rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the next call.
+constexpr int rows_a_sum = 64;
 template <class T, class F>
 const T* sums_of_blocks(Compute& compute, int rows, int columns, F&& f) {
-    const int blocks = share(rows, row_block);
+    const int blocks = divide_up(rows, rows_a_sum);
     const size_t size = static_cast<size_t>(blocks) * static_cast<size_t>(columns);
     T* const sums = reinterpret_cast<T*>(compute.sums.room(size * sizeof(T)));
-    for_rows(compute, blocks, 8 * row_block * columns, [&](int begin, int end) {
+    for_rows(compute, blocks, 8 * rows_a_sum * columns, [&](int begin, int end) {
         std::fill(sums + static_cast<ptrdiff_t>(begin) * columns, sums + static_cast<ptrdiff_t>(end) * columns, T(0));
-        for (int row = begin * row_block; row < std::min(rows, end * row_block); ++row)
-            f(row, sums + static_cast<ptrdiff_t>(row / row_block) * columns);
+        for (int row = begin * rows_a_sum; row < std::min(rows, end * rows_a_sum); ++row)
+            f(row, sums + static_cast<ptrdiff_t>(row / rows_a_sum) * columns);
     });
     return sums;
 }
@@ -1053,24 +1045,24 @@ struct Affine {
 };
 
 // What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
-// columns [begin, end) of a row y of the result, backward(dy, y, row, begin, end) turns that row's gradient into the
-// sum's, in place.
+// columns [begin, end) of a row y of the result, backward(dy, y, row) turns that row's gradient into the sum's, in place.
 struct Identity {
     template <class T>
     void forward(T*, int, int, int) const {}
     template <class T>
-    void backward(T*, const T*, int, int, int) const {}
+    void backward(T*, const T*, int) const {}
 };
 
-// max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
+// max(y, 0), `d` columns. The slope at 0 is 0, as in PyTorch; NaN stays.
 struct Relu {
+    int d;
     template <class T>
     void forward(T* y, int, int begin, int end) const {
         for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
     }
     template <class T>
-    void backward(T* dy, const T* y, int, int begin, int end) const {
-        for (int j = begin; j < end; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
+    void backward(T* dy, const T* y, int) const {
+        for (int j = 0; j < d; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
     }
 };
 
@@ -1096,10 +1088,10 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     tape.on_backward([=, &compute] {
         const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) {
             T* dy = row_of(y.gradient, row);
-            finish.backward(dy, row_of(y.value, row), row, 0, count);
+            finish.backward(dy, row_of(y.value, row), row);
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
-        add_column_sums(compute, db, sums, share(y.rows, row_block), count, count);
+        add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
@@ -1180,8 +1172,9 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
         // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
         const T* sums = sums_of_blocks<T>(compute, x.rows, 3 * d, [=](ptrdiff_t row, T* sum) {
             const T* n = normalised + row * d;
-            T *dy = y.gradient + row * d, *dx = x.gradient + row * d, *g = sum + 2 * d;  // g: no sum, but near
-            finish.backward(dy, y.value + row * d, static_cast<int>(row), 0, d);
+            T *dy = y.gradient + row * d, *dx = x.gradient + row * d,
+              *g = sum + 2 * d;  // beside the sums, in the cache
+            finish.backward(dy, y.value + row * d, static_cast<int>(row));
             for (int j = 0; j < d; ++j) {
                 sum[j] += dy[j] * n[j];
                 sum[d + j] += dy[j];
@@ -1190,8 +1183,8 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
             const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
         });
-        add_column_sums(compute, d_weight, sums, share(x.rows, row_block), d, 3 * d);
-        add_column_sums(compute, d_bias, sums + d, share(x.rows, row_block), d, 3 * d);
+        add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 3 * d);
+        add_column_sums(compute, d_bias, sums + d, divide_up(x.rows, rows_a_sum), d, 3 * d);
     });
     return y;
 }
@@ -1204,29 +1197,27 @@ struct Dropout {
     uint32_t site;
     float probability;
 
-    // factor[i - first] of element i, for i in [first, last).
+    // factor [n] of the elements [first, first + n).
     template <class T>
-    void fill(T* factor, size_t first, size_t last) const {
+    void fill(T* factor, size_t first, size_t n) const {
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
-        if (probability == 0) std::fill_n(factor, last - first, T(1));
-        for (size_t i = first; probability != 0 && i < last;) {  // element i has word i % 4 of counter i / 4
+        if (probability == 0) return void(std::fill_n(factor, n, T(1)));
+        for (size_t i = 0; i < n;) {  // element e has word e % 4 of counter e / 4
             uint32_t words[64];
-            random.words_16(words, step, static_cast<uint32_t>(i / 4), site);
-            const size_t skipped = i % 4, count = std::min(last - i, 64 - skipped);
-            for (size_t j = 0; j < count; ++j) factor[i - first + j] = words[skipped + j] < threshold ? T(0) : keep;
-            i += count;
+            random.words_16(words, step, static_cast<uint32_t>((first + i) / 4), site);
+            for (size_t j = (first + i) % 4; j < 64 && i < n; ++j, ++i) factor[i] = words[j] < threshold ? T(0) : keep;
         }
     }
 
-    // x[i - first] *= the factor of element i, for i in [first, last).
+    // x [n] *= the factors of the elements [first, first + n).
     template <class T>
-    void apply(T* x, size_t first, size_t last) const {
+    void apply(T* x, size_t first, size_t n) const {
         T factor[256];
-        for (size_t i = first; probability != 0 && i < last; i += 256, x += 256) {
-            const size_t count = std::min(last - i, size_t{256});
-            fill(factor, i, i + count);
-            for (size_t j = 0; j < count; ++j) x[j] *= factor[j];
+        for (size_t i = 0; probability != 0 && i < n; i += 256) {
+            const size_t count = std::min(n - i, size_t{256});
+            fill(factor, first + i, count);
+            for (size_t j = 0; j < count; ++j) x[i + j] *= factor[j];
         }
     }
 };
@@ -1246,12 +1237,12 @@ struct DropoutAdd {
 
     DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
     void forward(T* y, int row, int begin, int end) const {
-        dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(row * d + end));
+        dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
-    void backward(T* dy, const T*, int row, int begin, int end) const {
-        for (int j = begin; residual.value && j < end; ++j) residual.gradient[row * d + j] += dy[j];
-        dropout.apply(dy + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(row * d + end));
+    void backward(T* dy, const T*, int row) const {
+        for (ptrdiff_t j = 0; residual.value && j < d; ++j) residual.gradient[row * d + j] += dy[j];
+        dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(d));
     }
 };
 
@@ -1281,7 +1272,7 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// to += sum_j weight_j row_j, columns [first, first + 16 Vectors), held in registers.
+// to += sum_j weight_j row_j, for 16 Vectors columns, held in registers (where there are 32 of 64 bytes).
 template <int Vectors, class T>
 ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride,
                                int n) {
@@ -1319,7 +1310,7 @@ void softmax(T* x, int n) {
     for (int i = 0; i < n; ++i) x[i] /= total;
 }
 
-// Causal attention with `heads` heads, dropout on the weights, on packed sequences.
+// Causal attention with `heads` heads, dropout on the weights, on packed sequences. Positions ascend within a span.
 // q [queries, d]; kv [tokens, 2 d]: keys, then values; head h has columns h d/heads onwards. Query i stands at token
 // position[i] of the whole batch and sees its own sequence up to and with itself. Returns [queries, d].
 template <class T>
@@ -1331,17 +1322,17 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     const Tensor<T> out = tape.make(q.rows, d);
     int longest = 1;
     for (int s = 0; s < span_count; ++s) longest = std::max(longest, spans[s].tokens);
-    const ptrdiff_t row = longest, rows = static_cast<ptrdiff_t>(heads) * row;  // from a query's weights to the next's
-    const size_t all = static_cast<size_t>(q.rows * rows);
-    T *weights = tape.template scratch<T>(all),  // [queries, heads, longest]
-        *d_weights = tape.template scratch<T>(tape.recording ? all : 0),
-      *factors = tape.template scratch<T>(static_cast<size_t>(span_count * row));  // [spans, longest] dropout's
+    const ptrdiff_t head = longest, query = heads * head;  // from the weights of one to those of the next
+    const size_t all = static_cast<size_t>(q.rows * query);
+    T* weights = tape.template scratch<T>(all);  // [queries, heads, longest]
+    T* d_weights = tape.template scratch<T>(tape.recording ? all : 0);
+    T* factors = tape.template scratch<T>(static_cast<size_t>(span_count * head));  // [spans, longest] dropout's
     Compute& compute = tape.compute;
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
     const auto each_head = [=, &compute](int cost, auto&& f) {  // f(span, its factors, head)
         for_rows(compute, span_count, cost, [=](int begin, int end) {
             for (int s = begin; s < end; ++s)
-                for (int h = 0; h < heads; ++h) f(spans[s], factors + s * row, h);
+                for (int h = 0; h < heads; ++h) f(spans[s], factors + s * head, h);
         });
     };
     const auto seen_by = [=](ptrdiff_t i, const Span& span) { return position[i] - span.first_token + 1; };
@@ -1349,10 +1340,10 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
         for (ptrdiff_t i = span.first_query; i < span.first_query + span.queries; ++i) {
             const int seen = seen_by(i, span);
             const T *key = kv.value + span.first_token * stride + h * size, *v = key + d;
-            T *w = weights + i * rows + h * row, *o = out.value + i * d + h * size;
+            T *w = weights + i * query + h * head, *o = out.value + i * d + h * size;
             dot_rows(w, q.value + i * d + h * size, key, stride, seen, size, scale);
             softmax(w, seen);
-            dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(w - weights + seen));
+            dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
             for (int j = 0; j < seen; ++j) factor[j] *= w[j];
             std::fill_n(o, size, T(0));
             add_rows(o, factor, 1, v, stride, seen, size);
@@ -1363,10 +1354,10 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
             const ptrdiff_t first_key = span.first_token * stride + h * size, last = span.first_query + span.queries;
             for (ptrdiff_t i = span.first_query; i < last; ++i) {
                 const int seen = seen_by(i, span);
-                T *w = weights + i * rows + h * row, *dw = d_weights + i * rows + h * row;
+                T *w = weights + i * query + h * head, *dw = d_weights + i * query + h * head;
                 // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
                 dot_rows(dw, out.gradient + i * d + h * size, kv.value + first_key + d, stride, seen, size, T(1));
-                dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(w - weights + seen));
+                dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
                 for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
                 const T mean = dot(w, dw, seen);
                 for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale, w[j] *= factor[j];
@@ -1375,10 +1366,10 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
             // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
             for (ptrdiff_t j = 0, i = span.first_query; j < span.tokens; ++j) {
                 while (i < last && seen_by(i, span) <= j) ++i;
-                const ptrdiff_t weight = i * rows + h * row + j, at = i * d + h * size;
+                const ptrdiff_t first = i * query + h * head + j, at = i * d + h * size;
                 T* d_key = kv.gradient + first_key + j * stride;
-                add_rows(d_key, d_weights + weight, rows, q.value + at, d, static_cast<int>(last - i), size);
-                add_rows(d_key + d, weights + weight, rows, out.gradient + at, d, static_cast<int>(last - i), size);
+                add_rows(d_key, d_weights + first, query, q.value + at, d, static_cast<int>(last - i), size);
+                add_rows(d_key + d, weights + first, query, out.gradient + at, d, static_cast<int>(last - i), size);
             }
         });
     });
@@ -1613,12 +1604,13 @@ Tensor<T> embed_tokens(Tape<T>& tape, const Transformer<T>& model, const Sequenc
         std::vector<int> rows, timesteps;
         for (const size_t step : steps) {
             rows.push_back(layout.step_token[step] + offset);
-            timesteps.push_back(std::min(batch.timesteps[step], config.max_timesteps - 1));  // ODT clips at the end
+            if (config.max_timesteps > 0)  // ODT clips at the end of its table
+                timesteps.push_back(std::min(batch.timesteps[step], config.max_timesteps - 1));
         }
         const int* kept = keep(tape, rows);
         const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
         add_named_rows(tape, tokens, kept, embedded, nullptr, count);
-        if (config.max_timesteps > 0) add_named_rows(tape, tokens, kept, positions, keep(tape, timesteps), count);
+        if (!timesteps.empty()) add_named_rows(tape, tokens, kept, positions, keep(tape, timesteps), count);
     };
     std::vector<size_t> all(batch.returns_to_go.size()), acted;  // steps: all, and those whose action is a token
     std::iota(all.begin(), all.end(), size_t{0});
@@ -1657,7 +1649,7 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
                               all_ask ? x : select_rows(tape, x, rows, asked), d);
     const std::string name = "transformer.h." + std::to_string(layer);
     const Tensor<T> x1 = tape.show(name + ".attn", linear(tape, a, block.attn_proj, add_x));
-    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{});
+    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{4 * d});
     const DropoutAdd<T> add_x1(dropout_at(tape, dropout_site(layer, 2), p), x1, d);
     return tape.show(name, linear(tape, hidden, block.mlp_proj, add_x1));
 }
@@ -1676,10 +1668,11 @@ Tensor<T> map(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
 // -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
 template <class T>
 Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
-    const auto slope = [](T t) { return T(3.5) * (T(1) - t * t); };
-    return map(
-        tape, x, [](T u) { return T(-5) + T(3.5) * (std::tanh(u) + T(1)); },
-        [=](T u, T) { return slope(std::tanh(u)); });
+    const auto value = [](T u) { return T(-5) + T(3.5) * (std::tanh(u) + T(1)); };
+    return map(tape, x, value, [](T u, T) {
+        const T t = std::tanh(u);
+        return T(3.5) * (T(1) - t * t);
+    });
 }
 
 template <class T>

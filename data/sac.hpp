@@ -125,7 +125,7 @@ struct Network {
 template <class T>
 using Pair = std::array<Network<T>, 2>;  // SAC sec. 6: two critics against overestimation
 
-// y [n, out] = x W^T + b, or max(that, 0): linear() and relu() of nn.hpp in fewer passes, and no packing for one row.
+// y [n, out] = x W^T + b, or max(that, 0): linear() with Relu of nn.hpp in fewer passes, and no packing for one row.
 template <class T>
 Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& bias, bool rectified) {
     const int in = x.columns, out = weight.rows();

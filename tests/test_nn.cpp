@@ -581,7 +581,7 @@ TEST(gradients_of_small_operations_equal_central_differences) {
     gradients.check("linear, dropout, residual", dropped(0, true), {&x, &y, &w, &b});
     gradients.check("linear, dropout, residual, p 0.4", dropped(0.4f, true), {&x, &y, &w, &b});
     gradients.check("linear, dropout, p 0.4", dropped(0.4f, false), {&x, &w, &b});
-    gradients.check("linear, relu", [&](auto& t) { return linear(t, x.tensor(), affine, Relu{}); }, {&x, &w, &b});
+    gradients.check("linear, relu", [&](auto& t) { return linear(t, x.tensor(), affine, Relu{4}); }, {&x, &w, &b});
     gradients.check("layer_norm, dropout, p 0.4",
                     [&](auto& t) {
                         const DropoutAdd<double> finish(dropout_of(t, 0.4f), {}, 3);
@@ -1377,9 +1377,9 @@ TEST(dropout_in_pieces_equals_dropout_of_the_whole) {
     const size_t n = 700;  // more than a chunk
     std::vector<double> whole(n), pieces(n, 3), filled(n);
     dropout.fill(whole.data(), 0, n);
-    for (size_t begin = 0; begin < n; begin += 7) dropout.fill(&filled[begin], begin, std::min(n, begin + 7));
+    for (size_t begin = 0; begin < n; begin += 7) dropout.fill(&filled[begin], begin, std::min(n - begin, size_t{7}));
     CHECK(same_bits(filled, whole));
-    for (size_t begin = 0; begin < n; begin += 350) dropout.apply(&pieces[begin], begin, begin + 350);
+    for (size_t begin = 0; begin < n; begin += 350) dropout.apply(&pieces[begin], begin, 350);
     for (double& x : whole) x *= 3;
     CHECK(same_bits(pieces, whole));
 }
