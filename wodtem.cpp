@@ -2155,7 +2155,7 @@ void make_folder(const fs::path& folder) {
 
 // A stand-in for the data set `id`, or the policy that walks through antmaze, at `path`.
 void collect(const std::string& id, const std::string& path, size_t steps, const Origin& origin,
-             const std::string& policy_path) {
+             const std::string& policy_path, int threads) {
     Console console;
     console.label = id;
     const auto show = [&](size_t done) {
@@ -2180,11 +2180,13 @@ void collect(const std::string& id, const std::string& path, size_t steps, const
     const Watch watch{
         [&](double share, const std::string& numbers) { console.show("training", share, [&] { return numbers; }); },
         [] { return stop_requested != 0; }};
+    const std::string checkpoint = folder + "/checkpoint.safetensors";
+    Training training = walker ? walker_training(origin.seed) : gym_training(*task, origin.seed, steps);
+    training.threads = threads;
     if (walker)
-        train_walker(path, walker_training(origin.seed), folder + "/checkpoint.safetensors", watch);
+        train_walker(path, training, checkpoint, watch);
     else
-        collect_medium_replay(path, *task, steps, origin, gym_training(*task, origin.seed, steps),
-                              folder + "/checkpoint.safetensors", watch);
+        collect_medium_replay(path, *task, steps, origin, training, checkpoint, watch);
     fs::remove_all(folder);
 }
 #endif
@@ -2203,6 +2205,7 @@ void command_collect(const Arguments& arguments) {
                                                ? static_cast<int64_t>(walker ? 0 : set->steps)
                                                : whole_number(arguments["--steps"], "--steps", 1, 100000000);
     [[maybe_unused]] const int64_t seed = whole_number(arguments["--seed"], "--seed", 0, 2147483647);
+    [[maybe_unused]] const int threads = thread_count(arguments);
     const std::string path = !arguments["--out"].empty()
                                  ? arguments["--out"]
                                  : std::string(own_folder) + "/" + (walker ? id + ".safetensors" : file_name(*set));
@@ -2212,7 +2215,7 @@ void command_collect(const Arguments& arguments) {
     const Origin origin{
         "wodtem collect " + id + " --steps " + std::to_string(steps) + " --seed " + std::to_string(seed),
         static_cast<uint32_t>(seed)};
-    collect(id, path, static_cast<size_t>(steps), origin, arguments["--policy"]);
+    collect(id, path, static_cast<size_t>(steps), origin, arguments["--policy"], threads);
     if (walker)
         std::printf("%s: the policy; wodtem collect antmaze-umaze --policy %s\n", path.c_str(), path.c_str());
     else
@@ -2482,7 +2485,7 @@ void command_bench(const Arguments& arguments) {
         if (what == "random-policy") return bench_random_policy(threads);
         std::printf("one core, physics d4rl; medians of 25 rounds; overhead: beside the engine's calls alone\n");
         for (const MujocoTask& task : mujoco_tasks) bench_environment(task);
-        return;
+        return bench_learner(arguments["--kernel"], threads);
 #else
         fail("mujoco.absent", "MuJoCo 2.2 was not there when this program was built; %s", mujoco_advice);
 #endif
@@ -2547,7 +2550,8 @@ const std::vector<Command>& commands() {
          {{"--out", "FILE", "", "where to write (default: runs/datasets under D4RL's file name)"},
           {"--steps", "N", "", "rows (default: as many as D4RL's)"},
           {"--policy", "FILE", "", "of a medium or antmaze set (default: the one that this program holds)"},
-          {"--seed", "N", "0", "of all that is drawn"}},
+          {"--seed", "N", "0", "of all that is drawn"},
+          {"--threads", "N", "0", "of the learner; 0: one per core; results do not depend on it"}},
          command_collect},
         {"trace",
          "TASK",
@@ -2584,7 +2588,7 @@ const std::vector<Command>& commands() {
          "[WHAT]",
          0,
          1,
-         "updates: kernels beside the machine's peak, look-ups; environments: steps a second; random-policy",
+         "updates: kernels beside the machine's peak, look-ups; environments: steps a second, of learning too; random-policy",
          {kernel_option, threads_option, {"--json", nullptr, "", "of updates: print one JSON array"}},
          command_bench},
         {"check",
@@ -2635,8 +2639,7 @@ void print_help(const Command* command) {
     if (std::string(command->name) == "collect") {
         std::printf("\nID, rows, and how long it takes on one core:\n");
         for (const PublishedDataSet& set : published_data_sets)
-            std::printf("  %-30s %8zu  %s\n", set.id, set.steps,
-                        set.collected_in ? set.collected_in : "needs --policy, which its medium-replay set ends with");
+            std::printf("  %-30s %8zu  %s\n", set.id, set.steps, set.collected_in);
         std::printf("  %-30s %8s  the policy of the antmaze sets, trained anew; 60,000 updates\n", walker_name, "");
         std::printf("A training that was stopped goes on with the same command.\n");
     }

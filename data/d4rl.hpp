@@ -31,7 +31,7 @@ struct PublishedDataSet {
     const char* sha256;
     int trajectories;  // complete ones
     double mean_return, deviation, high, low;
-    const char* collected_in;  // what `wodtem collect` takes on one core, as measured; null: it has no policy to use
+    const char* collected_in;  // what `wodtem collect` takes on one core, as measured
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
 constexpr std::array<PublishedDataSet, 13> published_data_sets{{
@@ -43,10 +43,10 @@ constexpr std::array<PublishedDataSet, 13> published_data_sets{{
      "85,000 updates of 5 ms"},
     {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 232254996,
      "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 1190, 2852.09, 1095.44, 4226.94, -6.61,
-     nullptr},
+     "2 minutes"},
     {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 86323963,
      "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 1093, 682.70, 895.96, 4132.00, -50.20,
-     "5 ms an update, 135,000 of them or more"},
+     "250,000 updates of 5 ms"},
     {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 237727262,
      "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 1000, 4770.33, 355.75, 5309.38, -310.23,
      "1 minute"},
@@ -54,10 +54,10 @@ constexpr std::array<PublishedDataSet, 13> published_data_sets{{
      "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 202, 3093.29, 1680.69, 4985.14, -638.49,
      "125,000 updates of 5 ms"},
     {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 376239825,
-     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 1202, 3051.26, NAN, NAN, NAN, nullptr},
+     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 1202, 3051.26, NAN, NAN, NAN, "4 minutes"},
     {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 136482252,
      "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 485, 975.94, NAN, NAN, NAN,
-     "5 ms an update, 60,000 of them or more"},
+     "390,000 updates of 7 ms"},
     {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
      1000000, 232532949, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", 0, NAN, NAN, NAN, NAN,
      "6 minutes"},
@@ -101,15 +101,10 @@ inline std::string find_data_set(const PublishedDataSet& set) {
         if (std::filesystem::exists(path)) return path;
         looked += (looked.empty() ? "" : " and ") + path;
     }
-    const std::string id = set.id, replay = std::string(find_mujoco_task(id)->name) + "-medium-replay-v2";
-    const std::string advice = set.collected_in
-                                   ? "a stand-in is made by: wodtem collect " + id + " (" + set.collected_in +
-                                         "); or give a file with --dataset"
-                                   : "this version holds no policy that makes a stand-in: wodtem collect " + replay +
-                                         " trains one, for wodtem collect " + id +
-                                         " --policy FILE; or give a file with --dataset";
-    fail("dataset.missing", "the data set of %s is not here: looked for %s. The original is published at %s%s; %s",
-         set.id, looked.c_str(), published_address, set.file, advice.c_str());
+    fail("dataset.missing",
+         "the data set of %s is not here: looked for %s. The original is published at %s%s; a stand-in is made by: "
+         "wodtem collect %s (%s); or give a file with --dataset",
+         set.id, looked.c_str(), published_address, set.file, set.id, set.collected_in);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -489,6 +489,25 @@ void bench_environment(const MujocoTask& task) {
                 rates[12], rates[12] * task.frame_skip, overheads[12], overheads[6], overheads[18]);
 }
 
+// The learner of the medium-replay sets, on hopper: a step of the environment and an update after each.
+void bench_learner(const std::string& kernel, int threads) {
+    LiveTask environment(*find_mujoco_task("hopper"));
+    sac::Settings settings = gym_training(*environment.body.task, 0, 20000).settings;
+    settings.random_steps = 1000, settings.steps_per_update = 1;
+    Compute compute(choose_kernel(kernel), threads);
+    sac::Learner learner(settings, environment.spec(), compute);
+    const auto learn = [&] {
+        for (const uint64_t end = learner.progress.updates + 200; learner.progress.updates < end;)
+            learner.step(environment);
+    };
+    learn();
+    std::vector<double> rates;
+    for (int round = 0; round < 9; ++round) rates.push_back(200 / seconds_of(learn));
+    std::sort(rates.begin(), rates.end());
+    std::printf("hopper's soft actor-critic, batch %d, %d threads: %.0f steps/s with an update each (%.0f to %.0f)\n",
+                settings.batch, threads, rates[4], rates[0], rates[8]);
+}
+
 // Mean and standard error over episodes.
 std::pair<double, double> mean_and_error(const std::vector<double>& values) {
     double sum = 0, squares = 0;

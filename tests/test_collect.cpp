@@ -398,7 +398,7 @@ TEST(trainings_have_the_published_levels_and_sizes) {
 // Within a tenth, as the mean of a whole set; ten episodes add three standard errors.
 TEST(shipped_policies_have_the_published_returns) {
     Tape<float> tape(one_thread());
-    for (const char* name : {"hopper", "halfcheetah"}) {
+    for (const char* name : {"hopper", "walker2d", "halfcheetah", "ant"}) {
         sac::SavedPolicy policy = embedded_policy(std::string(name) + "-medium");
         LiveTask environment(task_of(name));
         const Moments returns = sampled_returns(tape, policy.network, environment, test_seed(), data_set_episodes, 10);

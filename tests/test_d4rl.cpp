@@ -147,7 +147,7 @@ TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
         try {
             find_data_set(*find_published("ant-medium-v2"));
         } catch (const Error& error) {
-            CHECK(std::string(error.what()).find("wodtem collect ant-medium-replay-v2") != std::string::npos);
+            CHECK(std::string(error.what()).find("wodtem collect ant-medium-v2 (") != std::string::npos);
         }
     }
     write_file_atomic(folder + "/maze2d-large-sparse-v1.hdf5", "x");
