@@ -737,7 +737,10 @@ struct Compute {
           packed_a(static_cast<size_t>(thread_count)) {}
 };
 
-inline int divide_up(int n, int by) { return (n + by - 1) / by; }
+template <class N>
+N divide_up(N n, std::type_identity_t<N> by) {
+    return (n + by - 1) / by;
+}
 
 // Rows and columns of C that a task works on.
 struct Block {
@@ -832,7 +835,7 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     }
 }
 
-// In double, for checks alone: matmul_plain row by row.
+// In double, for checks alone: matmul_plain's sums, a row of C at a time, along rows of B.
 template <class After = Nothing>
 void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
             Store store, After after = {}) {
@@ -1045,24 +1048,24 @@ struct Affine {
 };
 
 // What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
-// columns [begin, end) of a row y of the result, backward(dy, y, row) turns that row's gradient into the sum's, in place.
+// columns [begin, end) of a row y of the result, backward(dy, y, row, columns) turns that row's gradient into the sum's, in
+// place.
 struct Identity {
     template <class T>
     void forward(T*, int, int, int) const {}
     template <class T>
-    void backward(T*, const T*, int) const {}
+    void backward(T*, const T*, int, int) const {}
 };
 
-// max(y, 0), `d` columns. The slope at 0 is 0, as in PyTorch; NaN stays.
+// max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
 struct Relu {
-    int d;
     template <class T>
     void forward(T* y, int, int begin, int end) const {
         for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
     }
     template <class T>
-    void backward(T* dy, const T* y, int) const {
-        for (int j = 0; j < d; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
+    void backward(T* dy, const T* y, int, int columns) const {
+        for (int j = 0; j < columns; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
     }
 };
 
@@ -1088,7 +1091,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     tape.on_backward([=, &compute] {
         const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) {
             T* dy = row_of(y.gradient, row);
-            finish.backward(dy, row_of(y.value, row), row);
+            finish.backward(dy, row_of(y.value, row), row, count);
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
@@ -1174,7 +1177,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
             const T* n = normalised + row * d;
             T *dy = y.gradient + row * d, *dx = x.gradient + row * d,
               *g = sum + 2 * d;  // beside the sums, in the cache
-            finish.backward(dy, y.value + row * d, static_cast<int>(row));
+            finish.backward(dy, y.value + row * d, static_cast<int>(row), d);
             for (int j = 0; j < d; ++j) {
                 sum[j] += dy[j] * n[j];
                 sum[d + j] += dy[j];
@@ -1240,9 +1243,9 @@ struct DropoutAdd {
         dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
-    void backward(T* dy, const T*, int row) const {
-        for (ptrdiff_t j = 0; residual.value && j < d; ++j) residual.gradient[row * d + j] += dy[j];
-        dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(d));
+    void backward(T* dy, const T*, int row, int columns) const {
+        for (int j = 0; residual.value && j < columns; ++j) residual.gradient[row * d + j] += dy[j];
+        dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(columns));
     }
 };
 
@@ -1649,7 +1652,7 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
                               all_ask ? x : select_rows(tape, x, rows, asked), d);
     const std::string name = "transformer.h." + std::to_string(layer);
     const Tensor<T> x1 = tape.show(name + ".attn", linear(tape, a, block.attn_proj, add_x));
-    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{4 * d});
+    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{});
     const DropoutAdd<T> add_x1(dropout_at(tape, dropout_site(layer, 2), p), x1, d);
     return tape.show(name, linear(tape, hidden, block.mlp_proj, add_x1));
 }
@@ -1883,7 +1886,7 @@ double block_of_squares(const T* x, size_t n) {
 // f(block, first, count) for each block of [0, n), on all threads.
 template <class F>
 void for_blocks(Compute& compute, size_t n, int work, F&& f) {
-    for_rows(compute, static_cast<int>((n + square_block - 1) / square_block), work, [&](int begin, int end) {
+    for_rows(compute, static_cast<int>(divide_up(n, square_block)), work, [&](int begin, int end) {
         for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
             f(b, b * square_block, std::min(n - b * square_block, square_block));
     });
@@ -1937,7 +1940,7 @@ double join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
     std::vector<double> sums;
     for (Parameter<T>& parameter : parameters) {
         const size_t n = parameter.value.size();
-        sums.assign((n + square_block - 1) / square_block, 0);
+        sums.assign(divide_up(n, square_block), 0);
         for_blocks(compute, n, square_block, [&](size_t block, size_t first, size_t count) {
             T* const gradient = parameter.gradient.data() + first;
             for (size_t other = n; other < parameter.gradient.size(); other += n) {
@@ -1975,7 +1978,7 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         m.resize(n);
         v.resize(n);
         const bool adapt = lamb && (config.weight_decay != 0 || config.always_adapt);
-        const size_t blocks = (n + square_block - 1) / square_block;
+        const size_t blocks = divide_up(n, square_block);
         std::vector<double> value_squares(blocks), step_squares(blocks);
         for_blocks(compute, n, 16 * square_block, [&](size_t block, size_t first, size_t count) {
             float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;

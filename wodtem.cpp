@@ -608,7 +608,7 @@ Parts parts_of_batch(const Settings& settings) {
     if (12 * settings.layers * settings.width * settings.width < 100000)
         return {static_cast<size_t>(std::min<int64_t>(8, settings.batch_size)), true};
     const int64_t windows = std::max<int64_t>(1, 2048 / (3 * settings.context_length));
-    return {static_cast<size_t>((settings.batch_size + windows - 1) / windows), false};
+    return {static_cast<size_t>(divide_up(settings.batch_size, windows)), false};
 }
 
 struct Run {
@@ -2551,7 +2551,7 @@ const std::vector<Command>& commands() {
           {"--steps", "N", "", "rows (default: as many as D4RL's)"},
           {"--policy", "FILE", "", "of a medium or antmaze set (default: the one that this program holds)"},
           {"--seed", "N", "0", "of all that is drawn"},
-          {"--threads", "N", "0", "of the learner; 0: one per core; results do not depend on it"}},
+          threads_option},
          command_collect},
         {"trace",
          "TASK",

@@ -93,9 +93,8 @@ struct Training {
     int threads = 1;                 // of the learner; what it learns does not depend on it
 };
 
-// D4RL's runs made as many updates as steps. Where ours learn faster they make fewer updates, so that the level is
-// reached after about as many steps as D4RL's replay buffer holds. It keeps an episode more than the set has rows, so
-// that the first row's episode is there from its beginning.
+// D4RL's runs made as many updates as steps; ours make fewer updates, which cost more than steps. The buffer keeps an
+// episode more than the set has rows, so that the first row's episode is there from its beginning.
 // departs from rlkit: a batch of 128 instead of 256, for half the time.
 inline Training gym_training(const MujocoTask& task, uint32_t seed, size_t rows) {
     Training training{std::string(task.name) + "-medium", {}, medium_return(task)};

@@ -500,12 +500,9 @@ void bench_learner(const std::string& kernel, int threads) {
         for (const uint64_t end = learner.progress.updates + 200; learner.progress.updates < end;)
             learner.step(environment);
     };
-    learn();
-    std::vector<double> rates;
-    for (int round = 0; round < 9; ++round) rates.push_back(200 / seconds_of(learn));
-    std::sort(rates.begin(), rates.end());
+    const Spread seconds = timed(9, learn);
     std::printf("hopper's soft actor-critic, batch %d, %d threads: %.0f steps/s with an update each (%.0f to %.0f)\n",
-                settings.batch, threads, rates[4], rates[0], rates[8]);
+                settings.batch, threads, 200 / seconds.median, 200 / seconds.high, 200 / seconds.low);
 }
 
 // Mean and standard error over episodes.

@@ -525,7 +525,7 @@ void check_mlp(Case& c) {
     const Tensor<T> b1 = graph.variable("c_fc.bias", shape_of(w1.columns));
     const Tensor<T> w2 = graph.variable("c_proj.weight", {static_cast<uint64_t>(w1.columns), any});
     const Tensor<T> b2 = graph.variable("c_proj.bias", shape_of(w2.columns));
-    const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Relu{w1.columns});
+    const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Relu{});
     const Tensor<T> y = linear(graph.tape, hidden, Affine<T>{w2, b2, Layout::in_out});
     graph.finish({{"y", shape_of(x.rows, w2.columns), y}});
 }
