@@ -385,7 +385,10 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
     for (int k = 0; k < depth; ++k) {
         Vector row_of_b[Vectors];
 #pragma GCC unroll 4
-        for (int v = 0; v < Vectors; ++v) row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
+        for (int v = 0; v < Vectors; ++v) {
+            row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
+            __builtin_prefetch(b + ptrdiff_t{16} * b_stride + v * lanes);  // for a B that lies far away, unpacked
+        }
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r) {
             const Vector element_of_a = a[r] - Vector{};  // a broadcast: x - 0 is x, also for -0
@@ -777,8 +780,8 @@ struct Nothing {
 };
 
 // The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles. A few
-// rows (acting) read B where it lies: packing it would cost as much as the product. after(block) is called for every
-// part of C after its last addition, while it is in a core's cache.
+// tiles of rows (acting) read B where it lies: packing it would cost as much as the product. after(block) is called for
+// every part of C after its last addition, while it is in a core's cache.
 template <class After = Nothing>
 void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
             After after = {}) {
@@ -788,7 +791,7 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
         return after(Block{0, M, 0, N});
     }
     const Kernel& kernel = compute.kernel;
-    const bool pack_b = kernel.parts > 0 || M > kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
+    const bool pack_b = kernel.parts > 0 || M > 4 * kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);

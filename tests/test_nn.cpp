@@ -333,7 +333,7 @@ TEST(matmul_has_the_bits_of_its_definition_around_every_tile_edge) {
         Compute compute(*kernel, 1);
         const int r = kernel->tile_rows, c = kernel->tile_columns;
         for (const int K : {0, 1, 255, 256, 257, 513})
-            for (const int M : {0, 1, r - 1, r, r + 1, 2 * r + 1})
+            for (const int M : {0, 1, r - 1, r, r + 1, 2 * r + 1, 4 * r + 1})
                 for (const int N : {0, 1, c - 1, c, c + 1, 2 * c})
                     if ((K < 300 && kernel->parts == 0) || (M != r - 1 && N != c - 1 && M <= r + 1 && N <= c + 1))
                         check_matmul(compute, draws, M, N, K);
