@@ -518,6 +518,7 @@ ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int fi
                 if (whole) {
                     x = &view(first_k + at_k, first_w + at_w);
                     y = AlongK ? x + 16 : x + view.stride;
+                    if (AlongK) __builtin_prefetch(x + 64), __builtin_prefetch(y + 64);
                 } else {
                     for (int i = 0; i < 32; ++i) {
                         const int some_k = AlongK ? k + i : at_k + i / 16, some_w = AlongK ? at_w : w + i % 16;
@@ -750,6 +751,18 @@ struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
+// Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along the
+// lines where these run along memory, else a few k of all panels at a time, which lie side by side.
+inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char* to, View<const float> view,
+                        int first_k, int depth, int first_line, int end_line) {
+    const int slice = view.transposed ? depth : 32;
+    for (int k = 0; k < depth; k += slice) {
+        char* panel = to + kernel.panel_bytes(width, k);
+        for (int line = first_line; line < end_line; line += width, panel += kernel.panel_bytes(width, depth))
+            pack(panel, view, first_k + k, line, std::min(slice, depth - k), std::min(width, end_line - line));
+    }
+}
+
 // The product of a block of rows with panels of B, for one step of k.
 inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a, View<const float> b,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
@@ -762,7 +775,8 @@ inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, V
         for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows, panel += a_panel)
             f(panel, i, std::min(kernel.tile_rows, block.end_row - i));
     };
-    tiles([&](char* panel, int i, int rows) { kernel.pack_a(panel, a_lines, first_k, i, depth, rows); });
+    pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
+                block.end_row);
     kernel.prepare(true);
     for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns) {
         const void* panel_b = &b(first_k, j);
@@ -795,7 +809,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
-    const int row_blocks = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), std::min(tiles, 4));
+    const int most = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4),
+              row_blocks = std::min(tiles, divide_up(most, compute.threads.count()) * compute.threads.count());
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels.
     const int depth = kernel.depth();
@@ -813,10 +828,10 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
                 divide_up(end_k - first_k, depth) * batches,
                 [&](int task, int) {
                     const int step = task / batches, first = task % batches * at_once, k = first_k + step * depth;
-                    char* to = packed_b(step) + static_cast<size_t>(first) * panel_bytes(depth_at(k));
-                    for (int p = first; p < std::min(panels, first + at_once); ++p, to += panel_bytes(depth_at(k)))
-                        kernel.pack_b(to, b, k, p * kernel.tile_columns, depth_at(k),
-                                      std::min(kernel.tile_columns, N - p * kernel.tile_columns));
+                    pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
+                                packed_b(step) + static_cast<size_t>(first) * panel_bytes(depth_at(k)), b, k,
+                                depth_at(k), first * kernel.tile_columns,
+                                std::min(N, (first + at_once) * kernel.tile_columns));
                 },
                 serial);
         compute.threads.run(
@@ -1055,19 +1070,19 @@ struct Affine {
 // the sum's.
 struct Identity {
     template <class T>
-    void forward(T*, int, int, int) const {}
+    ALWAYS_INLINE void forward(T*, int, int, int) const {}
     template <class T>
-    void backward(T*, const T*, int, int) const {}
+    ALWAYS_INLINE void backward(T*, const T*, int, int) const {}
 };
 
 // max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
 struct Relu {
     template <class T>
-    void forward(T* y, int, int begin, int end) const {
+    ALWAYS_INLINE void forward(T* y, int, int begin, int end) const {
         for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
     }
     template <class T>
-    void backward(T* dy, const T* y, int, int columns) const {
+    ALWAYS_INLINE void backward(T* dy, const T* y, int, int columns) const {
         for (int j = 0; j < columns; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
     }
 };
@@ -1081,7 +1096,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     const ptrdiff_t offset = transposed ? static_cast<ptrdiff_t>(first) * w.columns : first;
     Compute& compute = tape.compute;
     const auto row_of = [count](T* data, int row) { return data + static_cast<ptrdiff_t>(row) * count; };
-    const auto finish_sums = [=](const Block& block) {
+    const auto finish_sums = [=](const Block& block) EACH_TARGET {
         for (int row = block.first_row; row < block.end_row; ++row) {
             T* sums = row_of(y.value, row);
             for (int j = block.first_column; j < block.end_column; ++j) sums[j] += bias[j];
@@ -1092,7 +1107,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
            count, x.columns, Store::overwrite, finish_sums);
     T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
     tape.on_backward([=, &compute] {
-        const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) {
+        const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) EACH_TARGET {
             T* dy = row_of(y.gradient, row);
             finish.backward(dy, row_of(y.value, row), row, count);
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
@@ -1154,43 +1169,41 @@ template <class T, class Finish = Identity>
 Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish finish = {}) {
     const int d = x.columns;
     const Tensor<T> y = tape.make(x.rows, d), weight = norm.weight, bias = norm.bias;
-    T* normalised = tape.template scratch<T>(x.size());                    // [n, d] (x - mean) / deviation
-    T* deviation = tape.template scratch<T>(static_cast<size_t>(x.rows));  // [n]
-    T* ones = tape.template scratch<T>(static_cast<size_t>(d));            // [d]
+    T* means = tape.template scratch<T>(static_cast<size_t>(x.rows));   // [n]
+    T* scales = tape.template scratch<T>(static_cast<size_t>(x.rows));  // [n] 1 / sqrt(variance + 1e-5)
+    T* ones = tape.template scratch<T>(static_cast<size_t>(d));         // [d]
     std::fill_n(ones, d, T(1));
     Compute& compute = tape.compute;
-    for_rows(compute, x.rows, 8 * d, [=](int begin, int end) {
+    for_rows(compute, x.rows, 8 * d, [=](int begin, int end) EACH_TARGET {
         for (ptrdiff_t row = begin; row < end; ++row) {
             const T* in = x.value + row * d;
-            T *centred = normalised + row * d, *out = y.value + row * d;
-            const T mean = dot(in, ones, d) / T(d);
-            for (int j = 0; j < d; ++j) centred[j] = in[j] - mean;
-            deviation[row] = std::sqrt(dot(centred, centred, d) / T(d) + T(1e-5));
-            for (int j = 0; j < d; ++j) {
-                centred[j] /= deviation[row];
-                out[j] = centred[j] * weight.value[j] + bias.value[j];
-            }
+            T* out = y.value + row * d;
+            const T mean = means[row] = dot(in, ones, d) / T(d);
+            for (int j = 0; j < d; ++j) out[j] = in[j] - mean;
+            const T scale = scales[row] = T(1) / std::sqrt(dot(out, out, d) / T(d) + T(1e-5));
+            for (int j = 0; j < d; ++j) out[j] = out[j] * scale * weight.value[j] + bias.value[j];
             finish.forward(out, static_cast<int>(row), 0, d);
         }
     });
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward([=, &compute] {
-        // With g = dy * weight: dx = (g - mean(g) - normalised * mean(g * normalised)) / deviation.
-        const T* sums = sums_of_blocks<T>(compute, x.rows, 3 * d, [=](ptrdiff_t row, T* sum) {
-            const T* n = normalised + row * d;
-            T *dy = y.gradient + row * d, *dx = x.gradient + row * d,
-              *g = sum + 2 * d;  // beside the sums, in the cache
+        // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
+        const T* sums = sums_of_blocks<T>(compute, x.rows, 4 * d, [=](ptrdiff_t row, T* sum) EACH_TARGET {
+            const T *in = x.value + row * d, mean = means[row], scale = scales[row];
+            T *dy = y.gradient + row * d, *dx = x.gradient + row * d;
+            T *g = sum + 2 * d, *n = sum + 3 * d;  // beside the sums, in the cache
             finish.backward(dy, y.value + row * d, static_cast<int>(row), d);
             for (int j = 0; j < d; ++j) {
+                n[j] = (in[j] - mean) * scale;
+                g[j] = dy[j] * weight.value[j];
                 sum[j] += dy[j] * n[j];
                 sum[d + j] += dy[j];
-                g[j] = dy[j] * weight.value[j];
             }
             const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
-            for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) / deviation[row];
+            for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
-        add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 3 * d);
-        add_column_sums(compute, d_bias, sums + d, divide_up(x.rows, rows_a_sum), d, 3 * d);
+        add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
+        add_column_sums(compute, d_bias, sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
     });
     return y;
 }
@@ -1205,20 +1218,22 @@ struct Dropout {
 
     // factor [n] of the elements [first, first + n).
     template <class T>
-    void fill(T* factor, size_t first, size_t n) const {
+    EACH_TARGET void fill(T* factor, size_t first, size_t n) const {
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
         if (probability == 0) return void(std::fill_n(factor, n, T(1)));
         for (size_t i = 0; i < n;) {  // element e has word e % 4 of counter e / 4
             uint32_t words[64];
             random.words_16(words, step, static_cast<uint32_t>((first + i) / 4), site);
-            for (size_t j = (first + i) % 4; j < 64 && i < n; ++j, ++i) factor[i] = words[j] < threshold ? T(0) : keep;
+            const size_t skip = (first + i) % 4, count = std::min(64 - skip, n - i);
+            for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
+            i += count;
         }
     }
 
     // x [n] *= the factors of the elements [first, first + n).
     template <class T>
-    void apply(T* x, size_t first, size_t n) const {
+    ALWAYS_INLINE void apply(T* x, size_t first, size_t n) const {
         T factor[256];
         for (size_t i = 0; probability != 0 && i < n; i += 256) {
             const size_t count = std::min(n - i, size_t{256});
@@ -1242,11 +1257,11 @@ struct DropoutAdd {
     ptrdiff_t d;
 
     DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
-    void forward(T* y, int row, int begin, int end) const {
+    ALWAYS_INLINE void forward(T* y, int row, int begin, int end) const {
         dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
-    void backward(T* dy, const T*, int row, int columns) const {
+    ALWAYS_INLINE void backward(T* dy, const T*, int row, int columns) const {
         for (int j = 0; residual.value && j < columns; ++j) residual.gradient[row * d + j] += dy[j];
         dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(columns));
     }
@@ -1293,20 +1308,20 @@ ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, 
 }
 
 // What attention does with n rows [size] that lie `stride` apart: y_j = scale (x . row_j), and the sum above.
-#define ATTENTION_ROWS(TARGET, T)                                                                                     \
-    TARGET inline void dot_rows(T* y, const T* x, const T* rows, ptrdiff_t stride, int n, int size, T scale) {        \
-        for (int j = 0; j < n; ++j) y[j] = dot(x, rows + j * stride, size) * scale;                                   \
-    }                                                                                                                 \
-    TARGET inline void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows, \
-                                ptrdiff_t stride, int n, int size) {                                                  \
-        int c = 0;                                                                                                    \
-        for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, stride, n);         \
-        for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, stride, n);           \
-        for (int j = 0; j < n; ++j)                                                                                   \
-            for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * stride + i];                 \
-    }
-ATTENTION_ROWS(EACH_TARGET, float)
-ATTENTION_ROWS(, double)
+template <class T>
+EACH_TARGET void dot_rows(T* y, const T* x, const T* rows, ptrdiff_t stride, int n, int size, T scale) {
+    for (int j = 0; j < n; ++j) y[j] = dot(x, rows + j * stride, size) * scale;
+}
+
+template <class T>
+EACH_TARGET void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows,
+                          ptrdiff_t stride, int n, int size) {
+    int c = 0;
+    for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, stride, n);
+    for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, stride, n);
+    for (int j = 0; j < n; ++j)
+        for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * stride + i];
+}
 
 template <class T>
 void softmax(T* x, int n) {
