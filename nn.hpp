@@ -18,6 +18,7 @@
 #include <cstdio>
 #include <cstring>
 #include <functional>
+#include <map>
 #include <memory>
 #include <new>
 #include <numeric>
@@ -25,7 +26,9 @@
 #include <string>
 #include <system_error>
 #include <thread>
+#include <tuple>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #if defined(__x86_64__) && !defined(__clang__)
@@ -265,6 +268,7 @@ struct View {
     T* data;
     int stride;
     bool transposed = false;
+    bool lasting = false;  // as B: used again before it changes (KeepPacked below)
     T& operator()(int i, int j) const {
         return transposed ? data[static_cast<ptrdiff_t>(j) * stride + i] : data[static_cast<ptrdiff_t>(i) * stride + j];
     }
@@ -735,10 +739,25 @@ struct Compute {
     Buffer packed_b;               // a stretch of B, in panels of tile_columns
     std::vector<Buffer> packed_a;  // one per worker
     Buffer sums;                   // of sums_of_blocks
+    struct Kept {
+        Buffer packed;
+        uint64_t period = 0;
+    };
+    std::map<std::tuple<const float*, bool, int, int>, Kept> kept;  // lasting Bs, whole: data, transposed, K, N
+    uint64_t period = 0, periods = 0;  // of time in which a lasting B stays what it is; 0: not now
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
           packed_a(static_cast<size_t>(thread_count)) {}
+};
+
+// For as long as it lives, no matrix that is called lasting may change: each is packed once.
+struct KeepPacked {
+    Compute& compute;
+    explicit KeepPacked(Compute& c) : compute(c) { compute.period = ++compute.periods; }
+    ~KeepPacked() { compute.period = 0; }
+    KeepPacked(const KeepPacked&) = delete;
+    KeepPacked& operator=(const KeepPacked&) = delete;
 };
 
 template <class N>
@@ -815,15 +834,21 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels.
     const int depth = kernel.depth();
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
-    const int steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, divide_up(K, depth));
-    char* const packed = pack_b ? compute.packed_b.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
+    Compute::Kept* const kept =
+        pack_b && b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.transposed, K, N}] : nullptr;
+    const int all_steps = divide_up(K, depth),
+              steps =
+                  kept ? all_steps : std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, all_steps);
+    Buffer& buffer = kept ? kept->packed : compute.packed_b;
+    char* const packed = pack_b ? buffer.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
+    const bool packed_before = kept && std::exchange(kept->period, compute.period) == compute.period;
     const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
     const auto panel_bytes = [&](int k) { return kernel.panel_bytes(kernel.tile_columns, k); };
     for (int first_k = 0; first_k < K; first_k += steps * depth) {
         const int end_k = std::min(K, first_k + steps * depth);
         const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
         const int at_once = std::max(1, panels / 8), batches = divide_up(panels, at_once);  // panels that a task packs
-        if (pack_b)
+        if (pack_b && !packed_before)
             compute.threads.run(
                 divide_up(end_k - first_k, depth) * batches,
                 [&](int task, int) {
@@ -938,6 +963,16 @@ class Arena {
     size_t chunk_ = 0, used_ = 0;
 };
 
+// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
+// row.
+template <class F>
+void for_rows(Compute& compute, int rows, int work, F&& f) {
+    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
+    const bool serial = static_cast<double>(rows) * work < 2e4;
+    compute.threads.run(
+        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
+}
+
 // Records each operation's backward step and replays them in reverse. Gradients are added to, never overwritten, so a
 // tensor may be used any number of times.
 template <class T>
@@ -959,7 +994,9 @@ struct Tape {
         x.value = scratch<T>(x.size());
         if (recording) {
             x.gradient = scratch<T>(x.size());
-            std::fill_n(x.gradient, x.size(), T(0));
+            for_rows(compute, rows, columns, [=](int begin, int end) {
+                std::fill_n(x.gradient + static_cast<ptrdiff_t>(begin) * columns, (end - begin) * columns, T(0));
+            });
         }
         return x;
     }
@@ -1015,16 +1052,6 @@ struct Tape {
     Arena arena_;
     std::vector<Step> steps_;
 };
-
-// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
-// row.
-template <class F>
-void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
-    const bool serial = static_cast<double>(rows) * work < 2e4;
-    compute.threads.run(
-        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
-}
 
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>
@@ -1103,8 +1130,8 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
             finish.forward(sums, row, block.first_column, block.end_column);
         }
     };
-    matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed}, x.rows,
-           count, x.columns, Store::overwrite, finish_sums);
+    matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed, true},
+           x.rows, count, x.columns, Store::overwrite, finish_sums);
     T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
     tape.on_backward([=, &compute] {
         const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) EACH_TARGET {
@@ -1115,8 +1142,8 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
-            matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed}, x.rows,
-                   x.columns, count, Store::accumulate);
+            matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
+                   x.rows, x.columns, count, Store::accumulate);
         if (transposed)  // dW^T += dy^T x
             matmul(compute, View<T>{dw, w.columns}, {y.gradient, count, true}, {x.value, x.columns}, count, x.columns,
                    x.rows, Store::accumulate);

@@ -863,12 +863,16 @@ struct Part {
 };
 
 // Standard normals for the entropy of the Gaussian head, [n, action_dim]; none for another head.
-std::vector<float> entropy_noise(const Run& run, const Batch& batch) {
-    std::vector<float> noise;
-    const size_t dim = static_cast<size_t>(run.agent.spec.action_dim);
+std::vector<float> entropy_noise(const Run& run, Compute& compute, const Batch& batch) {
+    const int dim = run.agent.spec.action_dim, n = static_cast<int>(batch.numbers.size());
+    if (run.agent.model.config.head != Head::squashed_gaussian) return {};
+    std::vector<float> noise(batch.actions.size());
     const Random random = run.random(Stream::entropy_noise);
-    for (size_t i = 0; run.agent.model.config.head == Head::squashed_gaussian && i < batch.actions.size(); ++i)
-        noise.push_back(random.normal(run.progress.updates, batch.numbers[i / dim], static_cast<uint32_t>(i % dim)));
+    for_rows(compute, n, 100 * dim, [&](int begin, int end) {
+        for (int i = begin * dim; i < end * dim; ++i)
+            noise[static_cast<size_t>(i)] = random.normal(
+                run.progress.updates, batch.numbers[static_cast<size_t>(i / dim)], static_cast<uint32_t>(i % dim));
+    });
     return noise;
 }
 
@@ -885,7 +889,7 @@ void learn_part(Run& run, Part& part, uint32_t number) {
     part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
     consult_memory(run, part.batch);
 
-    const std::vector<float> noise = entropy_noise(run, part.batch);
+    const std::vector<float> noise = entropy_noise(run, tape.compute, part.batch);
     const Objective<float> result =
         learn(tape, run.agent.model, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
     part.loss = result.L.value[0];
@@ -904,10 +908,12 @@ void update(Run& run) {
             part.problem = std::current_exception();
         }
     };
-    if (run.parts.side_by_side)
+    if (run.parts.side_by_side) {
         run.compute.threads.run(static_cast<int>(parts.size()), learn);
-    else
+    } else {
+        const KeepPacked weights(run.compute);
         for (size_t part = 0; part < parts.size(); ++part) learn(static_cast<int>(part), 0);
+    }
     double loss = 0, entropy = 0;
     for (const Part& part : parts) {
         if (part.problem) std::rethrow_exception(part.problem);

@@ -106,7 +106,7 @@ void dump_update(Run& run, const std::string& path) {
     if (constrain) dump.add("in/log_temperature", {}, temperature[0].value);
     Batch batch = sample_batch(run, 0, static_cast<uint32_t>(run.agent.settings.batch_size));
     consult_memory(run, batch);
-    const std::vector<float> noise = entropy_noise(run, batch);
+    const std::vector<float> noise = entropy_noise(run, run.compute, batch);
     dump_batch(dump, run, batch, noise);
 
     Tape<float> tape(run.compute);

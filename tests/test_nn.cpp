@@ -353,6 +353,34 @@ TEST(matmul_gives_the_same_bits_for_any_number_of_threads) {
         }
 }
 
+TEST(matmul_packs_a_lasting_matrix_once_a_period_and_again_in_the_next) {
+    Draws draws = {4};
+    constexpr int M = 70, N = 67, K = 700;
+    const std::vector<float> a = draws.normals<float>(M * K);
+    for (const Kernel* kernel : kernels_of_this_machine())
+        for (const bool transposed : {false, true}) {
+            Compute compute(*kernel, 2);
+            std::vector<float> b = draws.normals<float>(K * N);
+            const auto times = [&](bool lasting) {
+                std::vector<float> c(M * N);
+                const View<const float> view = {b.data(), transposed ? K : N, transposed, lasting};
+                matmul(compute, View<float>{c.data(), N}, {a.data(), K}, view, M, N, K, Store::overwrite);
+                return c;
+            };
+            for (int period = 0; period < 2; ++period) {
+                const std::vector<float> expected = times(false);
+                {
+                    const KeepPacked now(compute);
+                    CHECK(same_bits(times(true), expected));
+                    b[5] += 1;  // which no one may do: this shows that it is not read again
+                    CHECK(same_bits(times(true), expected));
+                    CHECK(!same_bits(times(false), expected));
+                }
+                CHECK(same_bits(times(true), times(false)));
+            }
+        }
+}
+
 TEST(matmul_of_one_row_equals_that_row_among_a_hundred) {
     Draws draws = {3};
     constexpr int M = 100, N = 64, K = 300;
