@@ -922,8 +922,22 @@ struct Tensor {
     T* value = nullptr;     // [rows, columns]
     T* gradient = nullptr;  // [rows, columns], accumulated
     int rows = 0, columns = 0;
+    bool* empty = nullptr;  // while it says so, nothing has been added to the gradient, and it holds no numbers
     size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
 };
+
+// Whether this is the first addition to x's gradient, which then must overwrite it. To be asked once per addition.
+template <class T>
+bool first_addition(Tensor<T> x) {
+    return x.empty && std::exchange(*x.empty, false);
+}
+
+// x's gradient, to be added to.
+template <class T>
+T* gradient_of(Tensor<T> x) {
+    if (first_addition(x)) std::fill_n(x.gradient, x.size(), T(0));
+    return x.gradient;
+}
 
 // Memory that is handed out in pieces and taken back all at once; after the first batch of a shape nothing is
 // allocated.
@@ -988,15 +1002,14 @@ struct Tape {
 
     explicit Tape(Compute& c) : compute(c) {}
 
-    // A result; its gradient, if recorded, starts at zero.
+    // A result; its gradient, if recorded, is empty.
     Tensor<T> make(int rows, int columns) {
         Tensor<T> x = {nullptr, nullptr, rows, columns};
         x.value = scratch<T>(x.size());
         if (recording) {
             x.gradient = scratch<T>(x.size());
-            for_rows(compute, rows, columns, [=](int begin, int end) {
-                std::fill_n(x.gradient + static_cast<ptrdiff_t>(begin) * columns, (end - begin) * columns, T(0));
-            });
+            x.empty = scratch<bool>(1);
+            *x.empty = true;
         }
         return x;
     }
@@ -1024,18 +1037,21 @@ struct Tape {
         return static_cast<Element*>(arena_.take(count * sizeof(Element)));
     }
 
-    // Keeps `step` for backward(). It is copied into the arena, so it may hold views and numbers only.
+    // Keeps `step` for backward(), which takes it if anything has been added to the gradient of its result. It is copied
+    // into the arena, so it may hold views and numbers only.
     template <class Step>
-    void on_backward(Step step) {
+    void on_backward(Tensor<T> result, Step step) {
         static_assert(std::is_trivially_destructible_v<Step>);
         if (!recording) return;
-        steps_.push_back({[](void* s) { (*static_cast<Step*>(s))(); }, new (arena_.take(sizeof(Step))) Step(step)});
+        steps_.push_back(
+            {[](void* s) { (*static_cast<Step*>(s))(); }, new (arena_.take(sizeof(Step))) Step(step), result.empty});
     }
 
     // d(loss)/d(everything recorded), for a loss [1, 1].
     void backward(Tensor<T> loss) {
-        loss.gradient[0] = 1;
-        for (size_t i = steps_.size(); i-- > 0;) steps_[i].call(steps_[i].step);
+        *gradient_of(loss) = 1;
+        for (size_t i = steps_.size(); i-- > 0;)
+            if (!steps_[i].empty || !*steps_[i].empty) steps_[i].call(steps_[i].step);
     }
 
     // Forgets all tensors made so far.
@@ -1048,6 +1064,7 @@ struct Tape {
     struct Step {
         void (*call)(void*);
         void* step;
+        const bool* empty;
     };
     Arena arena_;
     std::vector<Step> steps_;
@@ -1094,8 +1111,9 @@ struct Affine {
 
 // What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
 // columns [begin, end) of a row y of the result, backward(dy, y, row, columns) turns that row's gradient, in place, into
-// the sum's.
+// the sum's; begin_backward() comes before that.
 struct Identity {
+    void begin_backward() {}
     template <class T>
     ALWAYS_INLINE void forward(T*, int, int, int) const {}
     template <class T>
@@ -1104,6 +1122,7 @@ struct Identity {
 
 // max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
 struct Relu {
+    void begin_backward() {}
     template <class T>
     ALWAYS_INLINE void forward(T* y, int, int begin, int end) const {
         for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
@@ -1133,7 +1152,8 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed, true},
            x.rows, count, x.columns, Store::overwrite, finish_sums);
     T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
-    tape.on_backward([=, &compute] {
+    tape.on_backward(y, [=, &compute]() mutable {
+        finish.begin_backward();
         const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) EACH_TARGET {
             T* dy = row_of(y.gradient, row);
             finish.backward(dy, row_of(y.value, row), row, count);
@@ -1143,7 +1163,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
-                   x.rows, x.columns, count, Store::accumulate);
+                   x.rows, x.columns, count, first_addition(x) ? Store::overwrite : Store::accumulate);
         if (transposed)  // dW^T += dy^T x
             matmul(compute, View<T>{dw, w.columns}, {y.gradient, count, true}, {x.value, x.columns}, count, x.columns,
                    x.rows, Store::accumulate);
@@ -1169,9 +1189,10 @@ void add_named_rows(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> f
     each([=](ptrdiff_t a, ptrdiff_t b) {
         for (ptrdiff_t j = 0; j < d; ++j) to.value[a + j] += from.value[b + j];
     });
-    tape.on_backward([=] {
+    tape.on_backward(to, [=] {
+        T* const gradient = gradient_of(from);
         each([=](ptrdiff_t a, ptrdiff_t b) {
-            for (ptrdiff_t j = 0; j < d; ++j) from.gradient[b + j] += to.gradient[a + j];
+            for (ptrdiff_t j = 0; j < d; ++j) gradient[b + j] += to.gradient[a + j];
         });
     });
 }
@@ -1213,7 +1234,9 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
         }
     });
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
-    tape.on_backward([=, &compute] {
+    tape.on_backward(y, [=, &compute]() mutable {
+        finish.begin_backward();
+        const bool first = first_addition(x);
         // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
         const T* sums = sums_of_blocks<T>(compute, x.rows, 4 * d, [=](ptrdiff_t row, T* sum) EACH_TARGET {
             const T *in = x.value + row * d, mean = means[row], scale = scales[row];
@@ -1227,6 +1250,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
                 sum[d + j] += dy[j];
             }
             const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
+            if (first) std::fill_n(dx, d, T(0));
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
         add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
@@ -1282,13 +1306,16 @@ struct DropoutAdd {
     Dropout dropout;
     Tensor<T> residual;  // [n, d]
     ptrdiff_t d;
+    bool first = false;  // addition to the residual's gradient
 
     DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
     ALWAYS_INLINE void forward(T* y, int row, int begin, int end) const {
         dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
+    void begin_backward() { first = first_addition(residual); }
     ALWAYS_INLINE void backward(T* dy, const T*, int row, int columns) const {
+        if (first) std::fill_n(residual.gradient + row * d, columns, T(0));
         for (int j = 0; residual.value && j < columns; ++j) residual.gradient[row * d + j] += dy[j];
         dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(columns));
     }
@@ -1397,7 +1424,8 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
             add_rows(o, factor, 1, v, stride, seen, size);
         }
     });
-    tape.on_backward([=] {
+    tape.on_backward(out, [=] {
+        const bool first_of_q = first_addition(q), first_of_kv = first_addition(kv);
         each_head(2 * work, [=](const Span& span, T* factor, int h) {
             const ptrdiff_t first_key = span.first_token * stride + h * size, last = span.first_query + span.queries;
             for (ptrdiff_t i = span.first_query; i < last; ++i) {
@@ -1409,13 +1437,16 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
                 for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
                 const T mean = dot(w, dw, seen);
                 for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale, w[j] *= factor[j];
-                add_rows(q.gradient + i * d + h * size, dw, 1, kv.value + first_key, stride, seen, size);
+                T* d_query = q.gradient + i * d + h * size;
+                if (first_of_q) std::fill_n(d_query, size, T(0));
+                add_rows(d_query, dw, 1, kv.value + first_key, stride, seen, size);
             }
             // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
             for (ptrdiff_t j = 0, i = span.first_query; j < span.tokens; ++j) {
                 while (i < last && seen_by(i, span) <= j) ++i;
                 const ptrdiff_t first = i * query + h * head + j, at = i * d + h * size;
                 T* d_key = kv.gradient + first_key + j * stride;
+                if (first_of_kv) std::fill_n(d_key, size, T(0)), std::fill_n(d_key + d, size, T(0));
                 add_rows(d_key, d_weights + first, query, q.value + at, d, static_cast<int>(last - i), size);
                 add_rows(d_key + d, weights + first, query, out.gradient + at, d, static_cast<int>(last - i), size);
             }
@@ -1707,8 +1738,9 @@ template <class T, class F, class Slope>
 Tensor<T> map(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
     const Tensor<T> y = tape.make(x.rows, x.columns);
     for (size_t i = 0; i < x.size(); ++i) y.value[i] = f(x.value[i]);
-    tape.on_backward([=] {
-        for (size_t i = 0; i < x.size(); ++i) x.gradient[i] += slope(x.value[i], y.value[i]) * y.gradient[i];
+    tape.on_backward(y, [=] {
+        T* const dx = gradient_of(x);
+        for (size_t i = 0; i < x.size(); ++i) dx[i] += slope(x.value[i], y.value[i]) * y.gradient[i];
     });
     return y;
 }
@@ -1741,13 +1773,13 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
         for (ptrdiff_t j = 0; j < moves; ++j) total += std::exp(x[j] - largest);
         for (ptrdiff_t j = 0; j < moves; ++j) y.value[row * moves + j] = x[j] - largest - std::log(total);
     }
-    tape.on_backward([=] {
+    tape.on_backward(y, [=] {
+        T* const dx = gradient_of(logits);
         for (ptrdiff_t row = 0; row < logits.rows; ++row) {
             const T *dy = y.gradient + row * moves, *log_p = y.value + row * moves;
             T total = 0;
             for (ptrdiff_t j = 0; j < moves; ++j) total += dy[j];
-            for (ptrdiff_t j = 0; j < moves; ++j)
-                logits.gradient[row * moves + j] += dy[j] - std::exp(log_p[j]) * total;
+            for (ptrdiff_t j = 0; j < moves; ++j) dx[row * moves + j] += dy[j] - std::exp(log_p[j]) * total;
         }
     });
     return y;
@@ -1793,14 +1825,15 @@ T log_tanh_slope(T u) {
 constexpr double half_log_2_pi = 0.91893853320467274;
 
 // The sum of each row of [rows, columns] elements, [rows, 1], in order: of value(i) for element i; slope(i, dy) passes
-// the gradient of its row's sum on.
+// the gradient of its row's sum on, adding to those of `inputs`.
 template <class T, class Value, class Slope>
-Tensor<T> row_sums(Tape<T>& tape, int rows, int columns, Value value, Slope slope) {
+Tensor<T> row_sums(Tape<T>& tape, std::array<Tensor<T>, 2> inputs, int rows, int columns, Value value, Slope slope) {
     const Tensor<T> y = tape.make(rows, 1);
     std::fill_n(y.value, rows, T(0));
     const ptrdiff_t n = static_cast<ptrdiff_t>(rows) * columns;
     for (ptrdiff_t i = 0; i < n; ++i) y.value[i / columns] += value(i);
-    tape.on_backward([=] {
+    tape.on_backward(y, [=] {
+        for (const Tensor<T>& input : inputs) gradient_of(input);
         for (ptrdiff_t i = 0; i < n; ++i) slope(i, y.gradient[i / columns]);
     });
     return y;
@@ -1819,7 +1852,7 @@ Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* action
         const T z = standardised(i);
         return T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(std::atanh(a.value[i]));
     };
-    return row_sums(tape, a.rows, a.columns, value, [=](ptrdiff_t i, T dy) {
+    return row_sums(tape, {mean, log_std}, a.rows, a.columns, value, [=](ptrdiff_t i, T dy) {
         const T z = standardised(i);
         mean.gradient[i] += dy * z / std::exp(log_std.value[i]);
         log_std.gradient[i] += dy * (z * z - T(1));
@@ -1836,7 +1869,7 @@ Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) 
     const auto value = [=](ptrdiff_t i) {
         return T(0.5) * n.value[i] * n.value[i] + log_std.value[i] + T(half_log_2_pi) + log_tanh_slope(sample(i));
     };
-    return row_sums(tape, n.rows, n.columns, value, [=](ptrdiff_t i, T dy) {
+    return row_sums(tape, {mean, log_std}, n.rows, n.columns, value, [=](ptrdiff_t i, T dy) {
         const T slope = T(-2) * std::tanh(sample(i));  // of log_tanh_slope
         mean.gradient[i] += dy * slope;
         log_std.gradient[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
@@ -1849,7 +1882,7 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
     const Tensor<T> a = tape.constant(actions, log_p.rows, 1);
     const auto named = [=](ptrdiff_t row) { return row * log_p.columns + static_cast<ptrdiff_t>(a.value[row]); };
     return row_sums(
-        tape, a.rows, 1, [=](ptrdiff_t row) { return log_p.value[named(row)]; },
+        tape, {log_p}, a.rows, 1, [=](ptrdiff_t row) { return log_p.value[named(row)]; },
         [=](ptrdiff_t row, T dy) { log_p.gradient[named(row)] += dy; });
 }
 
@@ -1857,7 +1890,8 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
 template <class T>
 Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
     return row_sums(
-        tape, log_p.rows, log_p.columns, [=](ptrdiff_t i) { return -std::exp(log_p.value[i]) * log_p.value[i]; },
+        tape, {log_p}, log_p.rows, log_p.columns,
+        [=](ptrdiff_t i) { return -std::exp(log_p.value[i]) * log_p.value[i]; },
         [=](ptrdiff_t i, T dy) { log_p.gradient[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
@@ -1867,7 +1901,7 @@ Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* action
     const Tensor<T> a = tape.constant(actions, prediction.rows, prediction.columns);
     const auto error = [=](ptrdiff_t i) { return prediction.value[i] - a.value[i]; };
     return row_sums(
-        tape, a.rows, a.columns, [=](ptrdiff_t i) { return error(i) * error(i) / T(a.columns); },
+        tape, {prediction}, a.rows, a.columns, [=](ptrdiff_t i) { return error(i) * error(i) / T(a.columns); },
         [=](ptrdiff_t i, T dy) { prediction.gradient[i] += dy * T(2) * error(i) / T(a.columns); });
 }
 
@@ -1876,7 +1910,7 @@ template <class T, class Number>
 Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
     const Tensor<T> c = tape.constant(coefficients, x.rows, 1);
     return row_sums(
-        tape, 1, x.rows, [=](ptrdiff_t i) { return c.value[i] * x.value[i]; },
+        tape, {x}, 1, x.rows, [=](ptrdiff_t i) { return c.value[i] * x.value[i]; },
         [=](ptrdiff_t i, T dy) { x.gradient[i] += c.value[i] * dy; });
 }
 
@@ -1885,9 +1919,9 @@ template <class T>
 Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
     const Tensor<T> z = tape.make(1, 1);
     z.value[0] = a * x.value[0] + b * y.value[0];
-    tape.on_backward([=] {
-        x.gradient[0] += a * z.gradient[0];
-        y.gradient[0] += b * z.gradient[0];
+    tape.on_backward(z, [=] {
+        *gradient_of(x) += a * z.gradient[0];
+        *gradient_of(y) += b * z.gradient[0];
     });
     return z;
 }

@@ -783,8 +783,8 @@ Tensor<T> log_prob(Tape<T>& tape, Head head, const Policy<T>& policy, const floa
     if (head == Head::squashed_gaussian) return gaussian_log_prob(tape, policy, actions);
     const Tensor<T> error = squared_error(tape, policy.mean, actions), negative = tape.make(error.rows, 1);
     for (int i = 0; i < error.rows; ++i) negative.value[i] = -error.value[i];
-    tape.on_backward([=] {
-        for (int i = 0; i < error.rows; ++i) error.gradient[i] -= negative.gradient[i];
+    tape.on_backward(negative, [=] {
+        for (int i = 0; i < error.rows; ++i) gradient_of(error)[i] -= negative.gradient[i];
     });
     return negative;
 }

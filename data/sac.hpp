@@ -139,12 +139,13 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
         for (ptrdiff_t j = 0; j < out; ++j) y.value[row * out + j] += b.value[j];
     if (rectified)
         for (size_t i = 0; i < y.size(); ++i) y.value[i] = y.value[i] < 0 ? T(0) : y.value[i];  // NaN stays
-    tape.on_backward([=, &compute] {
+    tape.on_backward(y, [=, &compute] {
         const View<const T> dy = {y.gradient, out}, dy_turned = {y.gradient, out, true};
         if (rectified)
             for (size_t i = 0; i < y.size(); ++i) y.gradient[i] = y.value[i] > 0 ? y.gradient[i] : T(0);
         if (x.gradient)  // dx += dy W
-            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, Store::accumulate);
+            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out,
+                   first_addition(x) ? Store::overwrite : Store::accumulate);
         // dW += dy^T x
         matmul(compute, View<T>{w.gradient, in}, dy_turned, {x.value, in}, out, in, x.rows, Store::accumulate);
         add_column_sums(compute, b.gradient, y.gradient, y.rows, out, out);
@@ -218,14 +219,16 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
             log_prob.value[row] -= T(0.5) * z[j] * z[j] + log_std + T(half_log_2_pi) + log_tanh_slope(u);
         }
     }
-    tape.on_backward([=] {
+    tape.on_backward({}, [=] {
+        const T *d_action = gradient_of(action), *d_log_prob_of = gradient_of(log_prob);
+        T* const d_output = gradient_of(output);
         for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
             const ptrdiff_t mean = i / A * 2 * A + i % A, l = mean + A;
-            const T a = action.value[i], d_log_prob = log_prob.gradient[i / A], log_std = output.value[l];
-            const T du = (T(1) - a * a) * action.gradient[i] + T(2) * a * d_log_prob;
-            output.gradient[mean] += du;
+            const T a = action.value[i], d_log_prob = d_log_prob_of[i / A], log_std = output.value[l];
+            const T du = (T(1) - a * a) * d_action[i] + T(2) * a * d_log_prob;
+            d_output[mean] += du;
             if (log_std >= T(-20) && log_std <= T(2))
-                output.gradient[l] += du * std::exp(log_std) * normal.value[i] - d_log_prob;
+                d_output[l] += du * std::exp(log_std) * normal.value[i] - d_log_prob;
         }
     });
     return {action, log_prob};
@@ -253,7 +256,8 @@ Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> a
     Compute& compute = tape.compute;
     const Tensor<T> d_second = input(tape, n, hidden), d_first = input(tape, n, hidden), d_action = input(tape, n, A);
     ptrdiff_t* rows = tape.template scratch<ptrdiff_t>(static_cast<size_t>(n));
-    tape.on_backward([=, &compute] {
+    tape.on_backward(y, [=, &compute] {
+        T* const d_actions = gradient_of(actions);
         for (size_t k = 0; k < 2; ++k) {
             int m = 0;
             for (ptrdiff_t i = 0; i < n; ++i)
@@ -274,7 +278,7 @@ Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> a
             matmul(compute, View<T>{d_action.value, A}, {d_first.value, hidden}, {weight[k][0] + S, S + A}, m, A,
                    hidden, Store::overwrite);
             for (ptrdiff_t i = 0; i < m; ++i)
-                for (ptrdiff_t j = 0; j < A; ++j) actions.gradient[rows[i] * A + j] += d_action.value[i * A + j];
+                for (ptrdiff_t j = 0; j < A; ++j) d_actions[rows[i] * A + j] += d_action.value[i * A + j];
         }
     });
     return y;

@@ -248,7 +248,7 @@ void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threa
     const std::vector<float> coefficients(tokens, 1.0f);
     Tensor<float> y;
     const auto backward = [&] {
-        std::fill_n(y.gradient, y.size(), 1e-3f);
+        std::fill_n(gradient_of(y), y.size(), 1e-3f);
         const Tensor<float> one = tape.make(1, 1);
         tape.backward(one);
     };

@@ -391,8 +391,9 @@ struct Graph {
         for (size_t i = 0; i < outputs.size(); ++i) {
             const T* from = upstream[i].values.data();
             const size_t count = upstream[i].values.size();
-            T* to = outputs[i].tensor.gradient;
-            tape.on_backward([=] {
+            const Tensor<T> output = outputs[i].tensor;
+            tape.on_backward({}, [=] {
+                T* const to = gradient_of(output);
                 for (size_t k = 0; k < count; ++k) to[k] += from[k];
             });
         }
@@ -552,7 +553,7 @@ void check_attention(Case& c) {
             for (ptrdiff_t j = 0; j < d; ++j) f(2 * i * d + j, i * d + j);
     };
     each([&](ptrdiff_t to, ptrdiff_t from) { kv.value[to] = k.value[from], kv.value[to + d] = v.value[from]; });
-    graph.tape.on_backward([=] {
+    graph.tape.on_backward(kv, [=] {
         each([=](ptrdiff_t from, ptrdiff_t to) {
             k.gradient[to] += kv.gradient[from], v.gradient[to] += kv.gradient[from + d];
         });

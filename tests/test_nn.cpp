@@ -495,8 +495,8 @@ double probe(Tape<double>& tape, const Build& build, bool backward) {
     double sum = 0;
     for (uint32_t i = 0; i < y.size(); ++i) sum += random.normal(0, i) * y.value[i];
     if (!backward) return sum;
-    tape.on_backward([=] {
-        for (uint32_t i = 0; i < y.size(); ++i) y.gradient[i] += random.normal(0, i);
+    tape.on_backward({}, [=] {
+        for (uint32_t i = 0; i < y.size(); ++i) gradient_of(y)[i] += random.normal(0, i);
     });
     tape.backward(tape.make(1, 1));
     return sum;
