@@ -831,19 +831,17 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     const int most = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4),
               row_blocks = std::min(tiles, divide_up(most, compute.threads.count()) * compute.threads.count());
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
-    // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels.
+    // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
     const int depth = kernel.depth();
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
     Compute::Kept* const kept =
         pack_b && b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.transposed, K, N}] : nullptr;
-    const int all_steps = divide_up(K, depth),
-              steps =
-                  kept ? all_steps : std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, all_steps);
+    const int all_steps = divide_up(K, depth), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
+              steps = kept ? all_steps : std::clamp(fitting, 1, all_steps);
     Buffer& buffer = kept ? kept->packed : compute.packed_b;
     char* const packed = pack_b ? buffer.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
     const bool packed_before = kept && std::exchange(kept->period, compute.period) == compute.period;
     const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
-    const auto panel_bytes = [&](int k) { return kernel.panel_bytes(kernel.tile_columns, k); };
     for (int first_k = 0; first_k < K; first_k += steps * depth) {
         const int end_k = std::min(K, first_k + steps * depth);
         const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
@@ -852,11 +850,11 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
             compute.threads.run(
                 divide_up(end_k - first_k, depth) * batches,
                 [&](int task, int) {
-                    const int step = task / batches, first = task % batches * at_once, k = first_k + step * depth;
+                    const int step = task / batches, k = first_k + step * depth,
+                              first = task % batches * at_once * kernel.tile_columns;
                     pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
-                                packed_b(step) + static_cast<size_t>(first) * panel_bytes(depth_at(k)), b, k,
-                                depth_at(k), first * kernel.tile_columns,
-                                std::min(N, (first + at_once) * kernel.tile_columns));
+                                packed_b(step) + kernel.panel_bytes(first, depth_at(k)), b, k, depth_at(k), first,
+                                std::min(N, first + at_once * kernel.tile_columns));
                 },
                 serial);
         compute.threads.run(
