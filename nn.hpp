@@ -522,6 +522,7 @@ ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int fi
                 if (whole) {
                     x = &view(first_k + at_k, first_w + at_w);
                     y = AlongK ? x + 16 : x + view.stride;
+                    // Two turns of k ahead: 16 lines at once are too many for the processor to foresee.
                     if (AlongK) __builtin_prefetch(x + 64), __builtin_prefetch(y + 64);
                 } else {
                     for (int i = 0; i < 32; ++i) {
@@ -771,7 +772,8 @@ struct Block {
 };
 
 // Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along the
-// lines where these run along memory, else a few k of all panels at a time, which lie side by side.
+// lines where these run along memory, else 32 k (what parts are packed by) of all panels at a time, which lie side by
+// side.
 inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char* to, View<const float> view,
                         int first_k, int depth, int first_line, int end_line) {
     const int slice = view.transposed ? depth : 32;
@@ -828,8 +830,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
-    const int most = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4),
-              row_blocks = std::min(tiles, divide_up(most, compute.threads.count()) * compute.threads.count());
+    const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4),
+              row_blocks = std::min(tiles, divide_up(fewest, compute.threads.count()) * compute.threads.count());
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
     const int depth = kernel.depth();
@@ -975,18 +977,8 @@ class Arena {
     size_t chunk_ = 0, used_ = 0;
 };
 
-// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
-// row.
-template <class F>
-void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
-    const bool serial = static_cast<double>(rows) * work < 2e4;
-    compute.threads.run(
-        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
-}
-
-// Records each operation's backward step and replays them in reverse. Gradients are added to, never overwritten, so a
-// tensor may be used any number of times.
+// Records each operation's backward step and replays them in reverse. Gradients add up, so a tensor may be used any
+// number of times.
 template <class T>
 struct Tape {
     Compute& compute;
@@ -1067,6 +1059,16 @@ struct Tape {
     Arena arena_;
     std::vector<Step> steps_;
 };
+
+// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
+// row.
+template <class F>
+void for_rows(Compute& compute, int rows, int work, F&& f) {
+    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
+    const bool serial = static_cast<double>(rows) * work < 2e4;
+    compute.threads.run(
+        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
+}
 
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>

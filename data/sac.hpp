@@ -219,7 +219,7 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
             log_prob.value[row] -= T(0.5) * z[j] * z[j] + log_std + T(half_log_2_pi) + log_tanh_slope(u);
         }
     }
-    tape.on_backward({}, [=] {
+    tape.on_backward({}, [=] {  // of two results, so always
         const T *d_action = gradient_of(action), *d_log_prob_of = gradient_of(log_prob);
         T* const d_output = gradient_of(output);
         for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
