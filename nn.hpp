@@ -32,10 +32,12 @@
 #include <vector>
 
 #if defined(__x86_64__) && !defined(__clang__)
-#include <cpuid.h>  // whether there is a matrix unit, and to ask for it
+#define X86_KERNELS  // in AVX2, AVX-512 and AMX, beside the portable ones
+#include <cpuid.h>   // whether there is a matrix unit, and to ask for it
 #include <sys/syscall.h>
 #include <unistd.h>
 #endif
+#define ALWAYS_INLINE [[gnu::always_inline]] inline
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Errors. Every failure is one sentence for the person at the terminal (what, where, expected and got, what to do) and
@@ -64,48 +66,79 @@ struct Error : std::runtime_error {
 
 using Words4 = std::array<uint32_t, 4>;
 
+// product = m times x's low half, 64 bits, or that for each lane. GCC 12 does not know the one instruction it takes.
+template <bool Avx512, class Number>
+ALWAYS_INLINE void multiply_low(Number& product, const Number& x, uint32_t m) {
+#ifdef X86_KERNELS
+    if constexpr (Avx512) {
+        asm("vpmuludq %2, %1, %0" : "=v"(product) : "v"(x), "v"(Number{} + m));
+        return;
+    }
+#endif
+    product = (x & 0xFFFFFFFF) * m;
+}
+
 // Philox4x32-10. Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011, section 3.3.
-inline Words4 philox(Words4 counter, uint32_t key0, uint32_t key1) {
+// Of one or more counters, in the low halves of 64 bits; they take turns, for each waits long for its products.
+template <bool Avx512, class Number, size_t Count>
+ALWAYS_INLINE void philox_rounds(Number (&counters)[Count][4], uint32_t key0, uint32_t key1) {
     for (int round = 0; round < 10; ++round) {
-        const uint64_t product0 = uint64_t{0xD2511F53} * counter[0];
-        const uint64_t product1 = uint64_t{0xCD9E8D57} * counter[2];
-        counter = {static_cast<uint32_t>(product1 >> 32) ^ counter[1] ^ key0, static_cast<uint32_t>(product1),
-                   static_cast<uint32_t>(product0 >> 32) ^ counter[3] ^ key1, static_cast<uint32_t>(product0)};
+        for (Number(&c)[4] : counters) {
+            Number product0, product1;
+            multiply_low<Avx512>(product0, c[0], 0xD2511F53);
+            multiply_low<Avx512>(product1, c[2], 0xCD9E8D57);
+            c[0] = (product1 >> 32) ^ c[1] ^ key0;
+            c[1] = product1;
+            c[2] = (product0 >> 32) ^ c[3] ^ key1;
+            c[3] = product0;
+        }
         key0 += 0x9E3779B9;  // golden ratio
         key1 += 0xBB67AE85;  // sqrt(3) - 1
     }
-    return counter;
+}
+
+inline Words4 philox(const Words4& counter, uint32_t key0, uint32_t key1) {
+    uint64_t c[1][4] = {{counter[0], counter[1], counter[2], counter[3]}};
+    philox_rounds<false>(c, key0, key1);
+    Words4 words;
+    for (size_t j = 0; j < 4; ++j) words[j] = static_cast<uint32_t>(c[0][j]);
+    return words;
 }
 
 // For the loops that cost most: compiled once for each instruction set, and chosen when the program starts. Every
 // operation is rounded by itself (-ffp-contract=off), so the bits are the same. (The sanitizers cannot start with it.)
-#if defined(__x86_64__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+#if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
 #define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
 #define EACH_TARGET
 #endif
 
-// words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16, eight at a time.
-EACH_TARGET inline void philox_16(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
-    typedef uint64_t Lanes __attribute__((vector_size(64)));  // 32-bit numbers, with room for their products
-    const Lanes low = Lanes{} + 0xFFFFFFFF, number = {0, 1, 2, 3, 4, 5, 6, 7};
-    for (uint32_t first = 0; first < 16; first += 8) {
-        Lanes c[4] = {(number + (counter[0] + first)) & low, Lanes{} + counter[1], Lanes{} + counter[2],
-                      Lanes{} + counter[3]};
-        uint32_t k0 = key0, k1 = key1;
-        for (int round = 0; round < 10; ++round) {
-            const Lanes product0 = c[0] * 0xD2511F53, product1 = c[2] * 0xCD9E8D57;
-            c[0] = (product1 >> 32) ^ c[1] ^ k0;
-            c[1] = product1 & low;
-            c[2] = (product0 >> 32) ^ c[3] ^ k1;
-            c[3] = product0 & low;
-            k0 += 0x9E3779B9;
-            k1 += 0xBB67AE85;
-        }
-        for (size_t i = 0; i < 8; ++i)
-            for (size_t j = 0; j < 4; ++j) words[4 * (first + i) + j] = static_cast<uint32_t>(c[j][i]);
+// words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16.
+template <bool Avx512>
+ALWAYS_INLINE void philox_16_of(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+    typedef uint64_t Lanes __attribute__((vector_size(64)));
+    Lanes c[2][4];
+    for (uint32_t half = 0; half < 2; ++half) {
+        c[half][0] = Lanes{0, 1, 2, 3, 4, 5, 6, 7} + (counter[0] + 8 * half);
+        for (size_t j = 1; j < 4; ++j) c[half][j] = Lanes{} + counter[j];
     }
+    philox_rounds<Avx512>(c, key0, key1);
+    for (size_t i = 0; i < 16; ++i)
+        for (size_t j = 0; j < 4; ++j) words[4 * i + j] = static_cast<uint32_t>(c[i / 8][j][i % 8]);
 }
+
+EACH_TARGET inline void philox_16_anywhere(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+    philox_16_of<false>(words, counter, key0, key1);
+}
+#ifdef X86_KERNELS
+__attribute__((target("arch=x86-64-v4"))) inline void philox_16_avx512(uint32_t* words, const Words4& counter,
+                                                                       uint32_t key0, uint32_t key1) {
+    philox_16_of<true>(words, counter, key0, key1);
+}
+inline const auto philox_16 = __builtin_cpu_supports("x86-64-v4") ? philox_16_avx512 : philox_16_anywhere;
+#else
+inline const auto philox_16 = philox_16_anywhere;
+#endif
 
 // Each use of chance has its own stream: switching one feature on or off moves no other's numbers. The values are part
 // of the format of a run (a porter needs them); never renumber.
@@ -357,11 +390,6 @@ struct Kernel {
     }
 };
 
-#if defined(__x86_64__) && !defined(__clang__)
-#define FUSED_KERNELS
-#endif
-#define ALWAYS_INLINE [[gnu::always_inline]] inline
-
 typedef float Float4 __attribute__((vector_size(16)));
 typedef float Float8 __attribute__((vector_size(32)));
 typedef float Float16 __attribute__((vector_size(64)));
@@ -369,7 +397,7 @@ typedef float Float16 __attribute__((vector_size(64)));
 // sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so the fused form is one instruction by name.
 template <bool Fused, class Vector>
 ALWAYS_INLINE void multiply_add(Vector& sum, const Vector& a, const Vector& b) {
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
     if constexpr (Fused) {
         asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
         return;
@@ -575,7 +603,7 @@ struct TilesInSoftware {
     }
 };
 
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
 // The matrix unit itself. Every instruction says that it may read and write memory, so the compiler keeps their order.
 struct TilesInAmx {
     static void prepare(bool begin) {
@@ -681,7 +709,7 @@ inline bool everywhere() { return true; }
                         NAME##_bf16x3 = tile_kernel<TILES, 2>(#NAME, "bf16x3", "bf16x3", SUPPORTED), \
                         NAME##_bf16 = tile_kernel<TILES, 1>(#NAME, "bf16", "bf16", SUPPORTED);
 PARTS(portable, TilesInSoftware, "bf16x6", everywhere)
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
 KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
 KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
        __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
@@ -691,7 +719,7 @@ KERNEL(portable, , Float4, 4, 2, false, true)
 
 // Best first.
 inline const Kernel* const kernels[] = {
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
     &amx_bf16x6,      &amx_bf16x3,      &amx_bf16,        &kernel_avx512, &kernel_avx2,
 #endif
     &kernel_portable, &portable_bf16x6, &portable_bf16x3, &portable_bf16};
@@ -737,9 +765,9 @@ struct Compute {
     static constexpr size_t stretch_bytes = 4 << 20;  // of B that is packed at a time: for the cache that cores share
     const Kernel& kernel;
     Threads threads;
-    Buffer packed_b;               // a stretch of B, in panels of tile_columns
-    std::vector<Buffer> packed_a;  // one per worker
-    Buffer sums;                   // of sums_of_blocks
+    Buffer packed_b;              // a stretch of B, in panels of tile_columns
+    std::vector<Buffer> scratch;  // one per worker, for a task: a block of A in panels, a head's rows
+    Buffer sums;                  // of sums_of_blocks
     struct Kept {
         Buffer packed;
         uint64_t period = 0;
@@ -749,7 +777,7 @@ struct Compute {
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
-          packed_a(static_cast<size_t>(thread_count)) {}
+          scratch(static_cast<size_t>(thread_count)) {}
 };
 
 // For as long as it lives, no matrix that is called lasting may change: each is packed once.
@@ -869,7 +897,7 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
                 };
                 const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
                 for (int k = first_k; k < end_k; k += depth)
-                    matmul_block(kernel, compute.packed_a[static_cast<size_t>(worker)], c, a, b,
+                    matmul_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a, b,
                                  pack_b ? packed_b((k - first_k) / depth) : nullptr, block, k, depth_at(k),
                                  k > 0 || store == Store::accumulate);
                 if (end_k == K) after(block);
@@ -895,22 +923,38 @@ void matmul(Compute& compute, View<double> c, View<const double> a, View<const d
     after(Block{0, M, 0, N});
 }
 
-// Sum of a[i] * b[i] in 16 lanes, folded in a fixed tree; faster than one chain of additions, and as reproducible.
-template <class T>
-ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
+// y_r = x . row_r for up to four rows [n], `stride` apart. The order of additions: 16 lanes, folded in a fixed tree, in
+// which the rows share vectors, then what is left over: faster than one chain, and as reproducible.
+template <int Rows, class T>
+ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdiff_t n) {
     typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
     typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
-    Lanes sum = {};
-    int i = 0;
+    Lanes sum[4] = {}, eights[2];
+    ptrdiff_t i = 0;
     for (; i + 16 <= n; i += 16)
-        sum += *reinterpret_cast<const Unaligned*>(a + i) * *reinterpret_cast<const Unaligned*>(b + i);
-    const auto eight = __builtin_shufflevector(sum, sum, 0, 1, 2, 3, 4, 5, 6, 7) +
-                       __builtin_shufflevector(sum, sum, 8, 9, 10, 11, 12, 13, 14, 15);
-    const auto four =
-        __builtin_shufflevector(eight, eight, 0, 1, 2, 3) + __builtin_shufflevector(eight, eight, 4, 5, 6, 7);
-    T rest = 0;
-    for (; i < n; ++i) rest += a[i] * b[i];
-    return ((four[0] + four[2]) + (four[1] + four[3])) + rest;
+        for (ptrdiff_t r = 0; r < Rows; ++r)
+            sum[r] +=
+                *reinterpret_cast<const Unaligned*>(x + i) * *reinterpret_cast<const Unaligned*>(rows + r * stride + i);
+    for (size_t pair = 0; pair < 2; ++pair) {
+        const Lanes &a = sum[2 * pair], &b = sum[2 * pair + 1];
+        eights[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+                       __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    }
+    const Lanes &a = eights[0], &b = eights[1];
+    const Lanes fours = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
+                        __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+    for (ptrdiff_t r = 0; r < Rows; ++r) {
+        T rest = 0;
+        for (ptrdiff_t j = i; j < n; ++j) rest += x[j] * rows[r * stride + j];
+        y[r] = ((fours[4 * r] + fours[4 * r + 2]) + (fours[4 * r + 1] + fours[4 * r + 3])) + rest;
+    }
+}
+
+template <class T>
+ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
+    T y;
+    dots<1>(&y, a, b, 0, n);
+    return y;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -926,16 +970,16 @@ struct Tensor {
     size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
 };
 
-// Whether this is the first addition to x's gradient, which then must overwrite it. To be asked once per addition.
+// How to store the next addition to x's gradient: the first overwrites. To be asked once per addition.
 template <class T>
-bool first_addition(Tensor<T> x) {
-    return x.empty && std::exchange(*x.empty, false);
+Store next_store(Tensor<T> x) {
+    return x.empty && std::exchange(*x.empty, false) ? Store::overwrite : Store::accumulate;
 }
 
 // x's gradient, to be added to.
 template <class T>
 T* gradient_of(Tensor<T> x) {
-    if (first_addition(x)) std::fill_n(x.gradient, x.size(), T(0));
+    if (next_store(x) == Store::overwrite) std::fill_n(x.gradient, x.size(), T(0));
     return x.gradient;
 }
 
@@ -1060,20 +1104,21 @@ struct Tape {
     std::vector<Step> steps_;
 };
 
-// Shares rows [0, rows) out in blocks; f(begin, end) must treat each row alone. `work`: about how many operations a
-// row.
+// Shares rows [0, rows) out in blocks; f(begin, end, worker) must treat each row alone. `work`: about how many
+// operations a row.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
     const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
     const bool serial = static_cast<double>(rows) * work < 2e4;
     compute.threads.run(
-        divide_up(rows, block), [&](int task, int) { f(task * block, std::min(rows, (task + 1) * block)); }, serial);
+        divide_up(rows, block),
+        [&](int task, int worker) { f(task * block, std::min(rows, (task + 1) * block), worker); }, serial);
 }
 
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>
 void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns, ptrdiff_t stride) {
-    for_rows(compute, divide_up(columns, 64), rows * 64, [=](int begin, int end) {
+    for_rows(compute, divide_up(columns, 64), rows * 64, [=](int begin, int end, int) {
         for (int row = 0; row < rows; ++row)
             for (int j = begin * 64; j < std::min(columns, end * 64); ++j) to[j] += from[row * stride + j];
     });
@@ -1087,7 +1132,7 @@ const T* sums_of_blocks(Compute& compute, int rows, int columns, F&& f) {
     const int blocks = divide_up(rows, rows_a_sum);
     const size_t size = static_cast<size_t>(blocks) * static_cast<size_t>(columns);
     T* const sums = reinterpret_cast<T*>(compute.sums.room(size * sizeof(T)));
-    for_rows(compute, blocks, 8 * rows_a_sum * columns, [&](int begin, int end) {
+    for_rows(compute, blocks, 8 * rows_a_sum * columns, [&](int begin, int end, int) {
         std::fill(sums + static_cast<ptrdiff_t>(begin) * columns, sums + static_cast<ptrdiff_t>(end) * columns, T(0));
         for (int row = begin * rows_a_sum; row < std::min(rows, end * rows_a_sum); ++row)
             f(row, sums + static_cast<ptrdiff_t>(row / rows_a_sum) * columns);
@@ -1163,7 +1208,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         const View<const T> dy = {y.gradient, count};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
-                   x.rows, x.columns, count, first_addition(x) ? Store::overwrite : Store::accumulate);
+                   x.rows, x.columns, count, next_store(x));
         if (transposed)  // dW^T += dy^T x
             matmul(compute, View<T>{dw, w.columns}, {y.gradient, count, true}, {x.value, x.columns}, count, x.columns,
                    x.rows, Store::accumulate);
@@ -1222,7 +1267,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
     T* ones = tape.template scratch<T>(static_cast<size_t>(d));         // [d]
     std::fill_n(ones, d, T(1));
     Compute& compute = tape.compute;
-    for_rows(compute, x.rows, 8 * d, [=](int begin, int end) EACH_TARGET {
+    for_rows(compute, x.rows, 8 * d, [=](int begin, int end, int) EACH_TARGET {
         for (ptrdiff_t row = begin; row < end; ++row) {
             const T* in = x.value + row * d;
             T* out = y.value + row * d;
@@ -1236,7 +1281,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward(y, [=, &compute]() mutable {
         finish.begin_backward();
-        const bool first = first_addition(x);
+        const Store store = next_store(x);
         // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
         const T* sums = sums_of_blocks<T>(compute, x.rows, 4 * d, [=](ptrdiff_t row, T* sum) EACH_TARGET {
             const T *in = x.value + row * d, mean = means[row], scale = scales[row];
@@ -1250,7 +1295,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
                 sum[d + j] += dy[j];
             }
             const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
-            if (first) std::fill_n(dx, d, T(0));
+            if (store == Store::overwrite) std::fill_n(dx, d, T(0));
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
         add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
@@ -1306,16 +1351,16 @@ struct DropoutAdd {
     Dropout dropout;
     Tensor<T> residual;  // [n, d]
     ptrdiff_t d;
-    bool first = false;  // addition to the residual's gradient
+    Store store = Store::accumulate;  // of the residual's gradient
 
     DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
     ALWAYS_INLINE void forward(T* y, int row, int begin, int end) const {
         dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
         for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
     }
-    void begin_backward() { first = first_addition(residual); }
+    void begin_backward() { store = next_store(residual); }
     ALWAYS_INLINE void backward(T* dy, const T*, int row, int columns) const {
-        if (first) std::fill_n(residual.gradient + row * d, columns, T(0));
+        if (store == Store::overwrite) std::fill_n(residual.gradient + row * d, columns, T(0));
         for (int j = 0; residual.value && j < columns; ++j) residual.gradient[row * d + j] += dy[j];
         dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(columns));
     }
@@ -1347,34 +1392,46 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// to += sum_j weight_j row_j, for 16 Vectors columns, held in registers (where there are 32 of 64 bytes).
+// to = or += sum_j weight_j row_j, for 16 Vectors columns, held in registers (where there are 32 of 64 bytes).
 template <int Vectors, class T>
-ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride,
-                               int n) {
+ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride, int n,
+                               Store store) {
     typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
     typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
-    Lanes sum[Vectors];
-    for (int v = 0; v < Vectors; ++v) sum[v] = *reinterpret_cast<const Unaligned*>(to + 16 * v);
+    Lanes sum[Vectors] = {};
+    for (int v = 0; store == Store::accumulate && v < Vectors; ++v)
+        sum[v] = *reinterpret_cast<const Unaligned*>(to + 16 * v);
     for (int j = 0; j < n; ++j)
         for (int v = 0; v < Vectors; ++v)
             sum[v] += weight[j * weight_stride] * *reinterpret_cast<const Unaligned*>(rows + j * stride + 16 * v);
     for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Unaligned*>(to + 16 * v) = sum[v];
 }
 
-// What attention does with n rows [size] that lie `stride` apart: y_j = scale (x . row_j), and the sum above.
+// What attention does with rows [n, size]: y_j = scale (x . row_j), and the sum above.
 template <class T>
-EACH_TARGET void dot_rows(T* y, const T* x, const T* rows, ptrdiff_t stride, int n, int size, T scale) {
-    for (int j = 0; j < n; ++j) y[j] = dot(x, rows + j * stride, size) * scale;
+EACH_TARGET void dot_rows(T* y, const T* x, const T* rows, int n, int size, T scale) {
+    ptrdiff_t j = 0;
+    for (; j + 4 <= n; j += 4) dots<4>(y + j, x, rows + j * size, size, size);
+    for (; j < n; ++j) y[j] = dot(x, rows + j * size, size);
+    for (j = 0; j < n; ++j) y[j] *= scale;
 }
 
 template <class T>
-EACH_TARGET void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows,
-                          ptrdiff_t stride, int n, int size) {
+EACH_TARGET void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows, int n,
+                          int size, Store store) {
     int c = 0;
-    for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, stride, n);
-    for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, stride, n);
-    for (int j = 0; j < n; ++j)
-        for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * stride + i];
+    for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, size, n, store);
+    if (store == Store::overwrite) std::fill(to + c, to + size, T(0));
+    for (ptrdiff_t j = 0; j < n; ++j)
+        for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * size + i];
+}
+
+// Rows [n, size] that lie `stride` apart, side by side: a row of the gym network's keys is 4 kB from the next, and a
+// cache keeps but eight or twelve lines of one address modulo 4 kB.
+template <class T>
+void gather_rows(T* to, const T* rows, ptrdiff_t stride, ptrdiff_t n, ptrdiff_t size) {
+    for (ptrdiff_t j = 0; j < n; ++j) std::copy_n(rows + j * stride, size, to + j * size);
 }
 
 template <class T>
@@ -1401,55 +1458,69 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     const size_t all = static_cast<size_t>(q.rows * query);
     T* weights = tape.template scratch<T>(all);  // [queries, heads, longest]
     T* d_weights = tape.template scratch<T>(tape.recording ? all : 0);
-    T* factors = tape.template scratch<T>(static_cast<size_t>(span_count * head));  // [spans, longest] dropout's
     Compute& compute = tape.compute;
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
-    const auto each_head = [=, &compute](int cost, auto&& f) {  // f(span, its factors, head)
-        for_rows(compute, span_count, cost, [=](int begin, int end) {
+    const auto each_head = [=, &compute](int cost,
+                                         auto&& f) {  // f(span, head, room for its rows and a number for each)
+        for_rows(compute, span_count, cost, [=, &compute](int begin, int end, int worker) {
+            Buffer& scratch = compute.scratch[static_cast<size_t>(worker)];
+            T* const room = reinterpret_cast<T*>(scratch.room(static_cast<size_t>(longest * (size + 1)) * sizeof(T)));
             for (int s = begin; s < end; ++s)
-                for (int h = 0; h < heads; ++h) f(spans[s], factors + s * head, h);
+                for (int h = 0; h < heads; ++h) f(spans[s], h, room, room + longest * size);
         });
     };
     const auto seen_by = [=](ptrdiff_t i, const Span& span) { return position[i] - span.first_token + 1; };
-    each_head(work, [=](const Span& span, T* factor, int h) {
-        for (ptrdiff_t i = span.first_query; i < span.first_query + span.queries; ++i) {
+    each_head(work, [=](const Span& span, int h, T* rows, T* factor) {
+        const ptrdiff_t end = span.first_query + span.queries;
+        const T* const key = kv.value + span.first_token * stride + h * size;
+        gather_rows(rows, key, stride, span.tokens, size);
+        for (ptrdiff_t i = span.first_query; i < end; ++i) {
+            T* const w = weights + i * query + h * head;
+            dot_rows(w, q.value + i * d + h * size, rows, seen_by(i, span), size, scale);
+            softmax(w, seen_by(i, span));
+        }
+        gather_rows(rows, key + d, stride, span.tokens, size);  // values
+        for (ptrdiff_t i = span.first_query; i < end; ++i) {
             const int seen = seen_by(i, span);
-            const T *key = kv.value + span.first_token * stride + h * size, *v = key + d;
-            T *w = weights + i * query + h * head, *o = out.value + i * d + h * size;
-            dot_rows(w, q.value + i * d + h * size, key, stride, seen, size, scale);
-            softmax(w, seen);
+            const T* const w = weights + i * query + h * head;
             dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
             for (int j = 0; j < seen; ++j) factor[j] *= w[j];
-            std::fill_n(o, size, T(0));
-            add_rows(o, factor, 1, v, stride, seen, size);
+            add_rows(out.value + i * d + h * size, factor, 1, rows, seen, size, Store::overwrite);
         }
     });
     tape.on_backward(out, [=] {
-        const bool first_of_q = first_addition(q), first_of_kv = first_addition(kv);
-        each_head(2 * work, [=](const Span& span, T* factor, int h) {
-            const ptrdiff_t first_key = span.first_token * stride + h * size, last = span.first_query + span.queries;
-            for (ptrdiff_t i = span.first_query; i < last; ++i) {
+        const Store to_q = next_store(q), to_kv = next_store(kv);
+        each_head(2 * work, [=](const Span& span, int h, T* rows, T* factor) {
+            const ptrdiff_t first = span.first_query, end = first + span.queries, at = h * size;
+            const ptrdiff_t first_key = span.first_token * stride + at;
+            gather_rows(rows, kv.value + first_key + d, stride, span.tokens, size);  // values
+            for (ptrdiff_t i = first; i < end; ++i) {
                 const int seen = seen_by(i, span);
                 T *w = weights + i * query + h * head, *dw = d_weights + i * query + h * head;
                 // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
-                dot_rows(dw, out.gradient + i * d + h * size, kv.value + first_key + d, stride, seen, size, T(1));
+                dot_rows(dw, out.gradient + i * d + at, rows, seen, size, T(1));
                 dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
                 for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
                 const T mean = dot(w, dw, seen);
                 for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale, w[j] *= factor[j];
-                T* d_query = q.gradient + i * d + h * size;
-                if (first_of_q) std::fill_n(d_query, size, T(0));
-                add_rows(d_query, dw, 1, kv.value + first_key, stride, seen, size);
+            }
+            // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
+            gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
+            for (ptrdiff_t i = first; i < end; ++i) {
+                add_rows(q.gradient + i * d + at, d_weights + i * query + h * head, 1, rows, seen_by(i, span), size,
+                         to_q);
             }
             // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
-            for (ptrdiff_t j = 0, i = span.first_query; j < span.tokens; ++j) {
-                while (i < last && seen_by(i, span) <= j) ++i;
-                const ptrdiff_t first = i * query + h * head + j, at = i * d + h * size;
-                T* d_key = kv.gradient + first_key + j * stride;
-                if (first_of_kv) std::fill_n(d_key, size, T(0)), std::fill_n(d_key + d, size, T(0));
-                add_rows(d_key, d_weights + first, query, q.value + at, d, static_cast<int>(last - i), size);
-                add_rows(d_key + d, weights + first, query, out.gradient + at, d, static_cast<int>(last - i), size);
-            }
+            const auto each_key = [=](T* d_key, const T* weight, const T* asking) {
+                gather_rows(rows, asking + first * d + at, d, span.queries, size);
+                for (ptrdiff_t j = 0, i = first; j < span.tokens; ++j, d_key += stride) {
+                    while (i < end && seen_by(i, span) <= j) ++i;
+                    add_rows(d_key, weight + i * query + h * head + j, query, rows + (i - first) * size,
+                             static_cast<int>(end - i), size, to_kv);
+                }
+            };
+            each_key(kv.gradient + first_key, d_weights, q.value);
+            each_key(kv.gradient + first_key + d, weights, out.gradient);
         });
     });
     return out;
@@ -1965,7 +2036,7 @@ double block_of_squares(const T* x, size_t n) {
 // f(block, first, count) for each block of [0, n), on all threads.
 template <class F>
 void for_blocks(Compute& compute, size_t n, int work, F&& f) {
-    for_rows(compute, static_cast<int>(divide_up(n, square_block)), work, [&](int begin, int end) {
+    for_rows(compute, static_cast<int>(divide_up(n, square_block)), work, [&](int begin, int end, int) {
         for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
             f(b, b * square_block, std::min(n - b * square_block, square_block));
     });

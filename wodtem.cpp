@@ -868,7 +868,7 @@ std::vector<float> entropy_noise(const Run& run, Compute& compute, const Batch& 
     if (run.agent.model.config.head != Head::squashed_gaussian) return {};
     std::vector<float> noise(batch.actions.size());
     const Random random = run.random(Stream::entropy_noise);
-    for_rows(compute, n, 100 * dim, [&](int begin, int end) {
+    for_rows(compute, n, 100 * dim, [&](int begin, int end, int) {
         for (int i = begin * dim; i < end * dim; ++i)
             noise[static_cast<size_t>(i)] = random.normal(
                 run.progress.updates, batch.numbers[static_cast<size_t>(i / dim)], static_cast<uint32_t>(i % dim));

@@ -144,8 +144,7 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
         if (rectified)
             for (size_t i = 0; i < y.size(); ++i) y.gradient[i] = y.value[i] > 0 ? y.gradient[i] : T(0);
         if (x.gradient)  // dx += dy W
-            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out,
-                   first_addition(x) ? Store::overwrite : Store::accumulate);
+            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, next_store(x));
         // dW += dy^T x
         matmul(compute, View<T>{w.gradient, in}, dy_turned, {x.value, in}, out, in, x.rows, Store::accumulate);
         add_column_sums(compute, b.gradient, y.gradient, y.rows, out, out);

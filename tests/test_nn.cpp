@@ -109,11 +109,13 @@ TEST(sixteen_counters_at_once_have_the_words_of_each) {
     for (uint32_t trial = 0; trial < 200; ++trial) {  // also where the counter wraps
         const Words4 counter = philox({trial, 1, 2, 3}, test_seed(), 0);
         const uint32_t first = trial % 2 == 0 ? counter[0] : 0xffffffff - trial % 16;
-        uint32_t words[64];
-        philox_16(words, {first, counter[1], counter[2], counter[3]}, trial, test_seed());
-        for (uint32_t i = 0; i < 16; ++i) {
-            const Words4 one = philox({first + i, counter[1], counter[2], counter[3]}, trial, test_seed());
-            for (uint32_t j = 0; j < 4; ++j) CHECK_EQUAL(words[4 * i + j], one[j]);
+        for (const auto sixteen : {philox_16, philox_16_anywhere}) {
+            uint32_t words[64];
+            sixteen(words, {first, counter[1], counter[2], counter[3]}, trial, test_seed());
+            for (uint32_t i = 0; i < 16; ++i) {
+                const Words4 one = philox({first + i, counter[1], counter[2], counter[3]}, trial, test_seed());
+                for (uint32_t j = 0; j < 4; ++j) CHECK_EQUAL(words[4 * i + j], one[j]);
+            }
         }
     }
 }
