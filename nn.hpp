@@ -550,8 +550,9 @@ ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int fi
                 if (whole) {
                     x = &view(first_k + at_k, first_w + at_w);
                     y = AlongK ? x + 16 : x + view.stride;
-                    // Two turns of k ahead: 16 lines at once are too many for the processor to foresee.
-                    if (AlongK) __builtin_prefetch(x + 64), __builtin_prefetch(y + 64);
+                    // Two turns of k ahead, or a panel: 16 lines at once are too many for the processor to foresee.
+                    const ptrdiff_t ahead = AlongK ? 64 : 32;
+                    __builtin_prefetch(x + ahead), __builtin_prefetch(y + ahead);
                 } else {
                     for (int i = 0; i < 32; ++i) {
                         const int some_k = AlongK ? k + i : at_k + i / 16, some_w = AlongK ? at_w : w + i % 16;
@@ -1443,13 +1444,14 @@ void softmax(T* x, int n) {
 }
 
 // Causal attention with `heads` heads, dropout on the weights, on packed sequences. Positions ascend within a span.
-// q [queries, d]; kv [tokens, 2 d]: keys, then values; head h has columns h d/heads onwards. Query i stands at token
-// position[i] of the whole batch and sees its own sequence up to and with itself. Returns [queries, d].
+// The queries are the first d columns of q [queries, ...], the keys and then the values the last 2 d of kv [tokens, ...],
+// which may be the same tensor; head h has columns h d/heads onwards of each. Query i stands at token position[i] of the
+// whole batch and sees its own sequence up to and with itself. Returns [queries, d].
 template <class T>
-Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans, int span_count, const int* position,
-                    int heads, Dropout dropout) {
-    const int d = q.columns, size = d / heads;
-    const ptrdiff_t stride = 2 * d;  // from a key to the next
+Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span* spans, int span_count,
+                    const int* position, int heads, Dropout dropout) {
+    const int size = d / heads;
+    const ptrdiff_t q_stride = q.columns, stride = kv.columns, keys = stride - 2 * d;
     const T scale = T(1) / std::sqrt(T(size));
     const Tensor<T> out = tape.make(q.rows, d);
     int longest = 1;
@@ -1461,7 +1463,7 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     Compute& compute = tape.compute;
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
     const auto each_head = [=, &compute](int cost,
-                                         auto&& f) {  // f(span, head, room for its rows and a number for each)
+                                         auto&& f) {  // f(span, head, room for `longest` rows of it, and numbers)
         for_rows(compute, span_count, cost, [=, &compute](int begin, int end, int worker) {
             Buffer& scratch = compute.scratch[static_cast<size_t>(worker)];
             T* const room = reinterpret_cast<T*>(scratch.room(static_cast<size_t>(longest * (size + 1)) * sizeof(T)));
@@ -1472,11 +1474,11 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
     const auto seen_by = [=](ptrdiff_t i, const Span& span) { return position[i] - span.first_token + 1; };
     each_head(work, [=](const Span& span, int h, T* rows, T* factor) {
         const ptrdiff_t end = span.first_query + span.queries;
-        const T* const key = kv.value + span.first_token * stride + h * size;
+        const T* const key = kv.value + span.first_token * stride + keys + h * size;
         gather_rows(rows, key, stride, span.tokens, size);
         for (ptrdiff_t i = span.first_query; i < end; ++i) {
             T* const w = weights + i * query + h * head;
-            dot_rows(w, q.value + i * d + h * size, rows, seen_by(i, span), size, scale);
+            dot_rows(w, q.value + i * q_stride + h * size, rows, seen_by(i, span), size, scale);
             softmax(w, seen_by(i, span));
         }
         gather_rows(rows, key + d, stride, span.tokens, size);  // values
@@ -1489,10 +1491,10 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
         }
     });
     tape.on_backward(out, [=] {
-        const Store to_q = next_store(q), to_kv = next_store(kv);
+        const Store to_q = next_store(q), to_kv = q.value == kv.value ? to_q : next_store(kv);
         each_head(2 * work, [=](const Span& span, int h, T* rows, T* factor) {
             const ptrdiff_t first = span.first_query, end = first + span.queries, at = h * size;
-            const ptrdiff_t first_key = span.first_token * stride + at;
+            const ptrdiff_t first_key = span.first_token * stride + keys + at;
             gather_rows(rows, kv.value + first_key + d, stride, span.tokens, size);  // values
             for (ptrdiff_t i = first; i < end; ++i) {
                 const int seen = seen_by(i, span);
@@ -1506,21 +1508,20 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, const Span* spans,
             }
             // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
             gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
-            for (ptrdiff_t i = first; i < end; ++i) {
-                add_rows(q.gradient + i * d + at, d_weights + i * query + h * head, 1, rows, seen_by(i, span), size,
-                         to_q);
-            }
+            for (ptrdiff_t i = first; i < end; ++i)
+                add_rows(q.gradient + i * q_stride + at, d_weights + i * query + h * head, 1, rows, seen_by(i, span),
+                         size, to_q);
             // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
-            const auto each_key = [=](T* d_key, const T* weight, const T* asking) {
-                gather_rows(rows, asking + first * d + at, d, span.queries, size);
+            const auto each_key = [=](T* d_key, const T* weight, const T* asking, ptrdiff_t from_one_to_next) {
+                gather_rows(rows, asking + first * from_one_to_next + at, from_one_to_next, span.queries, size);
                 for (ptrdiff_t j = 0, i = first; j < span.tokens; ++j, d_key += stride) {
                     while (i < end && seen_by(i, span) <= j) ++i;
                     add_rows(d_key, weight + i * query + h * head + j, query, rows + (i - first) * size,
                              static_cast<int>(end - i), size, to_kv);
                 }
             };
-            each_key(kv.gradient + first_key, d_weights, q.value);
-            each_key(kv.gradient + first_key + d, weights, out.gradient);
+            each_key(kv.gradient + first_key, d_weights, q.value, q_stride);
+            each_key(kv.gradient + first_key + d, weights, out.gradient, d);
         });
     });
     return out;
@@ -1791,9 +1792,10 @@ Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int laye
     const bool all_ask = asked == x.rows;
     const int* rows = keep(tape, asking);
     const Tensor<T> h = layer_norm(tape, x, block.ln_1);
-    const Tensor<T> q = linear(tape, all_ask ? h : select_rows(tape, h, rows, asked), block.c_attn, 0, d);
-    const Tensor<T> kv = linear(tape, h, block.c_attn, d, 2 * d);
-    const Tensor<T> a = attention(tape, q, kv, keep(tape, spans), static_cast<int>(spans.size()), rows,
+    const Tensor<T> q = all_ask ? linear(tape, h, block.c_attn)  // keys and values as well
+                                : linear(tape, select_rows(tape, h, rows, asked), block.c_attn, 0, d);
+    const Tensor<T> kv = all_ask ? q : linear(tape, h, block.c_attn, d, 2 * d);
+    const Tensor<T> a = attention(tape, q, kv, d, keep(tape, spans), static_cast<int>(spans.size()), rows,
                                   model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
     const DropoutAdd<T> add_x(dropout_at(tape, dropout_site(layer, 1), p),
                               all_ask ? x : select_rows(tape, x, rows, asked), d);

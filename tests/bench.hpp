@@ -264,9 +264,8 @@ void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threa
     for (int i = 0; i < tokens; ++i) position.push_back(i);
     const Spread attend = timed(9, [&] {
         tape.reset();
-        const size_t q_size = static_cast<size_t>(tokens) * d;
-        const Tensor<float> q = tensor(d), kv = {&values[q_size], &gradients[q_size], tokens, 2 * d};
-        y = attention(tape, q, kv, spans.data(), windows, position.data(), 4, dropout_at(tape, 0, 0.1f));
+        const Tensor<float> qkv = tensor(3 * d);
+        y = attention(tape, qkv, qkv, d, spans.data(), windows, position.data(), 4, dropout_at(tape, 0, 0.1f));
         backward();
     });
     add("attention, 4 heads, forward and backward", attend, 7 * 2.0 * tokens * 30 * d, 11 * row_bytes);

@@ -565,8 +565,8 @@ void check_attention(Case& c) {
         const int first = spans.empty() ? 0 : spans.back().first_token + spans.back().tokens;
         spans.push_back({first, length, first, length});
     }
-    const Tensor<T> y = attention(graph.tape, q, kv, spans.data(), static_cast<int>(spans.size()), position.data(),
-                                  heads, dropout_at(graph.tape, 0, 0));
+    const Tensor<T> y = attention(graph.tape, q, kv, static_cast<int>(d), spans.data(), static_cast<int>(spans.size()),
+                                  position.data(), heads, dropout_at(graph.tape, 0, 0));
     graph.finish({{"y", shape_of(n, d), y}});
 }
 

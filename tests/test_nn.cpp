@@ -652,10 +652,18 @@ TEST(gradients_of_attention_equal_central_differences) {
             for (const float p : {0.0f, 0.3f}) {
                 Parameter<double> q = leaf(draws, subset ? 4 : 8, 6), kv = leaf(draws, 8, 12);
                 const Build build = [&](Tape<double>& tape) {
-                    return attention(tape, q.tensor(), kv.tensor(), (subset ? some : all).data(), 3,
+                    return attention(tape, q.tensor(), kv.tensor(), 6, (subset ? some : all).data(), 3,
                                      (subset ? asking : everyone).data(), heads, dropout_of(tape, p));
                 };
                 gradients.check("attention", build, {&q, &kv});
+                Parameter<double> qkv = leaf(draws, 8, 18);  // one tensor, as every layer but the last has it
+                const Build build_of_one = [&](Tape<double>& tape) {
+                    Tensor<double> one = qkv.tensor();
+                    one.empty = tape.scratch<bool>(1);
+                    *one.empty = true;
+                    return attention(tape, one, one, 6, all.data(), 3, everyone.data(), heads, dropout_of(tape, p));
+                };
+                gradients.check("attention of one tensor", build_of_one, {&qkv});
             }
 }
 
@@ -916,7 +924,7 @@ TEST(attention_equals_attention_plain) {
         }
     const Span span = {0, n, 0, n};
     const int position[n] = {0, 1, 2, 3, 4, 5, 6};
-    const Tensor<double> out = attention(tape, queries, kv, &span, 1, position, 1, dropout_of(tape, 0));
+    const Tensor<double> out = attention(tape, queries, kv, d, &span, 1, position, 1, dropout_of(tape, 0));
     for (size_t i = 0; i < n * d; ++i) CHECK_CLOSE(out.value[i], expected[i], 1e-14);
 }
 
