@@ -944,10 +944,13 @@ ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdi
     const Lanes &a = eights[0], &b = eights[1];
     const Lanes fours = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
                         __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+    const Lanes twos =
+        fours + __builtin_shufflevector(fours, fours, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    const Lanes ones = twos + __builtin_shufflevector(twos, twos, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
     for (ptrdiff_t r = 0; r < Rows; ++r) {
         T rest = 0;
         for (ptrdiff_t j = i; j < n; ++j) rest += x[j] * rows[r * stride + j];
-        y[r] = ((fours[4 * r] + fours[4 * r + 2]) + (fours[4 * r + 1] + fours[4 * r + 3])) + rest;
+        y[r] = ones[4 * r] + rest;
     }
 }
 
