@@ -2135,27 +2135,28 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         const bool adapt = lamb && (config.weight_decay != 0 || config.always_adapt);
         const size_t blocks = divide_up(n, square_block);
         std::vector<double> value_squares(blocks), step_squares(blocks);
+        std::vector<unsigned char> bad(blocks);
+        double trust = 1;
+        const auto apply = [&](size_t block, size_t first, size_t count) {
+            const float rate = static_cast<float>(learning_rate * trust);
+            const float shrink =
+                lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
+            float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
+            bad[block] = !apply_step(value, step, count, shrink, rate);
+        };
         for_blocks(compute, n, 16 * square_block, [&](size_t block, size_t first, size_t count) {
             float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
             adam_step(step, m.data() + first, v.data() + first, value, count, config, scale, bias1, bias2);
-            if (adapt)
-                value_squares[block] = block_of_squares(value, count),
-                step_squares[block] = block_of_squares(step, count);
+            if (!adapt) return apply(block, first, count);
+            value_squares[block] = block_of_squares(value, count);
+            step_squares[block] = block_of_squares(step, count);
         });
-        double trust = 1;
         if (adapt) {
             const double value_norm = std::sqrt(std::accumulate(value_squares.begin(), value_squares.end(), 0.0));
             const double step_norm = std::sqrt(std::accumulate(step_squares.begin(), step_squares.end(), 0.0));
             if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
+            for_blocks(compute, n, 4 * square_block, apply);
         }
-        const float rate = static_cast<float>(learning_rate * trust);
-        const float shrink =
-            lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
-        std::vector<unsigned char> bad(blocks);
-        for_blocks(compute, n, 4 * square_block, [&](size_t block, size_t first, size_t count) {
-            bad[block] =
-                !apply_step(parameter.value.data() + first, parameter.gradient.data() + first, count, shrink, rate);
-        });
         if (std::count(bad.begin(), bad.end(), 1) > 0)
             fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
     }
