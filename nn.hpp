@@ -907,19 +907,12 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     }
 }
 
-// In double, for checks alone: matmul_plain's sums, a row of C at a time, along rows of B.
+// In double, for checks alone.
 template <class After = Nothing>
 void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
             Store store, After after = {}) {
     compute.threads.run(M, [&](int i, int) {
-        for (int j = 0; store == Store::overwrite && j < N; ++j) c(i, j) = 0;
-        std::vector<double> sums(static_cast<size_t>(N));
-        for (int first = 0; first < K; first += sum_block) {
-            std::fill(sums.begin(), sums.end(), 0.0);
-            for (int k = first; k < std::min(K, first + sum_block); ++k)
-                for (int j = 0; j < N; ++j) sums[static_cast<size_t>(j)] += a(i, k) * b(k, j);
-            for (int j = 0; j < N; ++j) c(i, j) += sums[static_cast<size_t>(j)];
-        }
+        matmul_plain<double>({&c(i, 0), c.stride}, {&a(i, 0), a.stride, a.transposed}, b, 1, N, K, store);
     });
     after(Block{0, M, 0, N});
 }

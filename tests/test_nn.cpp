@@ -658,9 +658,7 @@ TEST(gradients_of_attention_equal_central_differences) {
                 gradients.check("attention", build, {&q, &kv});
                 Parameter<double> qkv = leaf(draws, 8, 18);  // one tensor, as every layer but the last has it
                 const Build build_of_one = [&](Tape<double>& tape) {
-                    Tensor<double> one = qkv.tensor();
-                    one.empty = tape.scratch<bool>(1);
-                    *one.empty = true;
+                    const Tensor<double> one = qkv.tensor();
                     return attention(tape, one, one, 6, all.data(), 3, everyone.data(), heads, dropout_of(tape, p));
                 };
                 gradients.check("attention of one tensor", build_of_one, {&qkv});
