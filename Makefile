@@ -7,7 +7,7 @@
 #   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
 #   make map              the map from the paper's equations to code, tests and vectors, as README.md holds it
-#   make mutants          which of 169 one-line mistakes the golden vectors and the tests find; about 15 minutes
+#   make mutants          which of 170 one-line mistakes the golden vectors and the tests find; about 15 minutes
 #   make bench            the machine's peak, each kernel's share of it, update and look-up times
 #   make format           lay out the sources with clang-format
 #   make clean            remove what was built (runs/ stays)

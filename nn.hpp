@@ -66,11 +66,11 @@ struct Error : std::runtime_error {
 
 using Words4 = std::array<uint32_t, 4>;
 
-// product = m times x's low half, 64 bits, or that for each lane. GCC 12 does not know the one instruction it takes.
-template <bool Avx512, class Number>
+// product = m times the low half of x, or of each lane. GCC 12 does not find the one instruction that this takes.
+template <class Number>
 ALWAYS_INLINE void multiply_low(Number& product, const Number& x, uint32_t m) {
 #ifdef X86_KERNELS
-    if constexpr (Avx512) {
+    if constexpr (sizeof(Number) == 64) {
         asm("vpmuludq %2, %1, %0" : "=v"(product) : "v"(x), "v"(Number{} + m));
         return;
     }
@@ -79,14 +79,15 @@ ALWAYS_INLINE void multiply_low(Number& product, const Number& x, uint32_t m) {
 }
 
 // Philox4x32-10. Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011, section 3.3.
-// Of one or more counters, in the low halves of 64 bits; they take turns, for each waits long for its products.
-template <bool Avx512, class Number, size_t Count>
+// Of one or more counters, in the low halves of 64 bits (what the high ones hold does not matter). They take turns: a
+// product is long in coming.
+template <class Number, size_t Count>
 ALWAYS_INLINE void philox_rounds(Number (&counters)[Count][4], uint32_t key0, uint32_t key1) {
     for (int round = 0; round < 10; ++round) {
         for (Number(&c)[4] : counters) {
             Number product0, product1;
-            multiply_low<Avx512>(product0, c[0], 0xD2511F53);
-            multiply_low<Avx512>(product1, c[2], 0xCD9E8D57);
+            multiply_low(product0, c[0], 0xD2511F53);
+            multiply_low(product1, c[2], 0xCD9E8D57);
             c[0] = (product1 >> 32) ^ c[1] ^ key0;
             c[1] = product1;
             c[2] = (product0 >> 32) ^ c[3] ^ key1;
@@ -99,7 +100,7 @@ ALWAYS_INLINE void philox_rounds(Number (&counters)[Count][4], uint32_t key0, ui
 
 inline Words4 philox(const Words4& counter, uint32_t key0, uint32_t key1) {
     uint64_t c[1][4] = {{counter[0], counter[1], counter[2], counter[3]}};
-    philox_rounds<false>(c, key0, key1);
+    philox_rounds(c, key0, key1);
     Words4 words;
     for (size_t j = 0; j < 4; ++j) words[j] = static_cast<uint32_t>(c[0][j]);
     return words;
@@ -114,30 +115,28 @@ inline Words4 philox(const Words4& counter, uint32_t key0, uint32_t key1) {
 #endif
 
 // words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16.
-template <bool Avx512>
-ALWAYS_INLINE void philox_16_of(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+inline void philox_16_plain(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+    for (uint32_t i = 0; i < 16; ++i) {
+        const Words4 four = philox({counter[0] + i, counter[1], counter[2], counter[3]}, key0, key1);
+        std::copy(four.begin(), four.end(), words + 4 * i);
+    }
+}
+#ifdef X86_KERNELS
+__attribute__((target("arch=x86-64-v4"))) inline void philox_16_avx512(uint32_t* words, const Words4& counter,
+                                                                       uint32_t key0, uint32_t key1) {
     typedef uint64_t Lanes __attribute__((vector_size(64)));
     Lanes c[2][4];
     for (uint32_t half = 0; half < 2; ++half) {
         c[half][0] = Lanes{0, 1, 2, 3, 4, 5, 6, 7} + (counter[0] + 8 * half);
         for (size_t j = 1; j < 4; ++j) c[half][j] = Lanes{} + counter[j];
     }
-    philox_rounds<Avx512>(c, key0, key1);
+    philox_rounds(c, key0, key1);
     for (size_t i = 0; i < 16; ++i)
         for (size_t j = 0; j < 4; ++j) words[4 * i + j] = static_cast<uint32_t>(c[i / 8][j][i % 8]);
 }
-
-EACH_TARGET inline void philox_16_anywhere(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
-    philox_16_of<false>(words, counter, key0, key1);
-}
-#ifdef X86_KERNELS
-__attribute__((target("arch=x86-64-v4"))) inline void philox_16_avx512(uint32_t* words, const Words4& counter,
-                                                                       uint32_t key0, uint32_t key1) {
-    philox_16_of<true>(words, counter, key0, key1);
-}
-inline const auto philox_16 = __builtin_cpu_supports("x86-64-v4") ? philox_16_avx512 : philox_16_anywhere;
+inline const auto philox_16 = __builtin_cpu_supports("x86-64-v4") ? philox_16_avx512 : philox_16_plain;
 #else
-inline const auto philox_16 = philox_16_anywhere;
+inline const auto philox_16 = philox_16_plain;
 #endif
 
 // Each use of chance has its own stream: switching one feature on or off moves no other's numbers. The values are part
@@ -272,8 +271,8 @@ class Threads {
         for (std::thread& worker : workers_) worker.join();
     }
 
-    // Spins for some milliseconds between jobs, soon giving way to whoever else wants the core, then sleeps: to be woken
-    // can take longer than a small job, above all on a virtual machine.
+    // Spins for some milliseconds between jobs, soon giving way to whoever else wants the core, then sleeps: to be
+    // woken can take longer than a small job, above all on a virtual machine.
     void work(int worker) {
         while (true) {
             const uint64_t seen = take_tasks(worker);
@@ -327,8 +326,8 @@ void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int
         }
 }
 
-// Matrix units multiply bf16, the upper half of a float. A float is the sum of bf16 parts, x = x_0 + x_1 + x_2, each the
-// nearest bf16 to what those before it leave over; a product is the sum of the products of parts i, j with i + j <
+// Matrix units multiply bf16, the upper half of a float. A float is the sum of bf16 parts, x = x_0 + x_1 + x_2, each
+// the nearest bf16 to what those before it leave over; a product is the sum of the products of parts i, j with i + j <
 // parts: one (`bf16`, relative error 2^-8), three of two parts each (`bf16x3`, 2^-16), or six of three (`bf16x6`, as
 // exact as float). The definition, for the order of additions: C takes in 32 k at a time, for these the products of
 // parts in turn, of each the sum over even k and the sum over odd k, added up from zero in order of k.
@@ -533,8 +532,8 @@ ALWAYS_INLINE void split_pairs(uint16_t* to, const float* x, const float* y, ptr
     }
 }
 
-// PackFunction for parts. A row of 16 pairs comes from 32 k of a line, or from 16 lines of two k, as they lie in memory;
-// where the panel wants it the other way round, 16 x 16 pairs are turned.
+// PackFunction for parts. A row of 16 pairs comes from 32 k of a line, or from 16 lines of two k, as they lie in
+// memory; where the panel wants it the other way round, 16 x 16 pairs are turned.
 template <int Parts, bool OfB, bool AlongK>
 ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int first_k, int first_w, int depth,
                                  int used) {
@@ -800,9 +799,9 @@ struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
-// Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along the
-// lines where these run along memory, else 32 k (what parts are packed by) of all panels at a time, which lie side by
-// side.
+// Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along
+// the lines where these run along memory, else 32 k (what parts are packed by) of all panels at a time, which lie side
+// by side.
 inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char* to, View<const float> view,
                         int first_k, int depth, int first_line, int end_line) {
     const int slice = view.transposed ? depth : 32;
@@ -917,40 +916,55 @@ void matmul(Compute& compute, View<double> c, View<const double> a, View<const d
     after(Block{0, M, 0, N});
 }
 
-// y_r = x . row_r for up to four rows [n], `stride` apart. The order of additions: 16 lanes, folded in a fixed tree, in
-// which the rows share vectors, then what is left over: faster than one chain, and as reproducible.
-template <int Rows, class T>
+// Whether vectors of 64 bytes fit a register. Where they do not, GCC 12 takes them apart in memory, ten times as slow
+// as vectors of 32.
+#ifdef X86_KERNELS
+inline const bool wide_vectors = __builtin_cpu_supports("avx512f");
+#else
+constexpr bool wide_vectors = false;
+#endif
+
+// y_r = x . row_r for up to four rows [n], `stride` apart. The order of additions: 16 lanes (Width of them a vector),
+// folded in a fixed tree, in which the rows share vectors, then what is left over: faster than one chain, and as
+// reproducible.
+template <int Rows, int Width, class T>
 ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdiff_t n) {
-    typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
+    typedef T Lanes __attribute__((vector_size(Width * sizeof(T))));
+    typedef T Eight __attribute__((vector_size(8 * sizeof(T))));
     typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
-    Lanes sum[4] = {}, eights[2];
+    Lanes sum[4][16 / Width] = {};
+    Eight eight[4], four[2];
     ptrdiff_t i = 0;
     for (; i + 16 <= n; i += 16)
         for (ptrdiff_t r = 0; r < Rows; ++r)
-            sum[r] +=
-                *reinterpret_cast<const Unaligned*>(x + i) * *reinterpret_cast<const Unaligned*>(rows + r * stride + i);
+            for (ptrdiff_t h = 0; h < 16; h += Width)
+                sum[r][h / Width] += *reinterpret_cast<const Unaligned*>(x + i + h) *
+                                     *reinterpret_cast<const Unaligned*>(rows + r * stride + i + h);
+    for (size_t r = 0; r < 4; ++r)
+        if constexpr (Width == 16)
+            eight[r] = __builtin_shufflevector(sum[r][0], sum[r][0], 0, 1, 2, 3, 4, 5, 6, 7) +
+                       __builtin_shufflevector(sum[r][0], sum[r][0], 8, 9, 10, 11, 12, 13, 14, 15);
+        else
+            eight[r] = sum[r][0] + sum[r][1];
     for (size_t pair = 0; pair < 2; ++pair) {
-        const Lanes &a = sum[2 * pair], &b = sum[2 * pair + 1];
-        eights[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
-                       __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+        const Eight &a = eight[2 * pair], &b = eight[2 * pair + 1];
+        four[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) +
+                     __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
     }
-    const Lanes &a = eights[0], &b = eights[1];
-    const Lanes fours = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27) +
-                        __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-    const Lanes twos =
-        fours + __builtin_shufflevector(fours, fours, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
-    const Lanes ones = twos + __builtin_shufflevector(twos, twos, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
+    const Eight two = __builtin_shufflevector(four[0], four[1], 0, 1, 4, 5, 8, 9, 12, 13) +
+                      __builtin_shufflevector(four[0], four[1], 2, 3, 6, 7, 10, 11, 14, 15);
+    const auto one = __builtin_shufflevector(two, two, 0, 2, 4, 6) + __builtin_shufflevector(two, two, 1, 3, 5, 7);
     for (ptrdiff_t r = 0; r < Rows; ++r) {
         T rest = 0;
         for (ptrdiff_t j = i; j < n; ++j) rest += x[j] * rows[r * stride + j];
-        y[r] = ones[4 * r] + rest;
+        y[r] = one[r] + rest;
     }
 }
 
 template <class T>
 ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
     T y;
-    dots<1>(&y, a, b, 0, n);
+    wide_vectors ? dots<1, 16>(&y, a, b, 0, n) : dots<1, 8>(&y, a, b, 0, n);
     return y;
 }
 
@@ -967,7 +981,7 @@ struct Tensor {
     size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
 };
 
-// How to store the next addition to x's gradient: the first overwrites. To be asked once per addition.
+// How to store the next addition to x's gradient: the first overwrites, all of it. To be asked once per addition.
 template <class T>
 Store next_store(Tensor<T> x) {
     return x.empty && std::exchange(*x.empty, false) ? Store::overwrite : Store::accumulate;
@@ -990,7 +1004,7 @@ class Arena {
         while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) ++chunk_, used_ = 0;
         if (chunk_ == chunks_.size()) add_chunk(std::max(bytes, size_t{1} << 20));
         used_ += bytes;
-        return chunks_[chunk_].data.get() + used_ - bytes;
+        return &chunks_[chunk_].lines[(used_ - bytes) / sizeof(Buffer::Line)];
     }
     // Joins the chunks into one, or batches of ever new shapes would each leave theirs behind.
     void reset() {
@@ -1004,16 +1018,13 @@ class Arena {
     }
 
   private:
-    void add_chunk(size_t bytes) {
-        chunks_.push_back({std::unique_ptr<char[], Release>(new (std::align_val_t{64}) char[bytes]), bytes});
-    }
-    struct Release {
-        void operator()(char* data) const { operator delete[](data, std::align_val_t{64}); }
-    };
     struct Chunk {
-        std::unique_ptr<char[], Release> data;
+        std::unique_ptr<Buffer::Line[]> lines;
         size_t bytes;
     };
+    void add_chunk(size_t bytes) {  // not initialised, as `new` without parentheses leaves it
+        chunks_.push_back({std::unique_ptr<Buffer::Line[]>(new Buffer::Line[bytes / sizeof(Buffer::Line)]), bytes});
+    }
     std::vector<Chunk> chunks_;
     size_t chunk_ = 0, used_ = 0;
 };
@@ -1068,8 +1079,8 @@ struct Tape {
         return static_cast<Element*>(arena_.take(count * sizeof(Element)));
     }
 
-    // Keeps `step` for backward(), which takes it if anything has been added to the gradient of its result. It is copied
-    // into the arena, so it may hold views and numbers only.
+    // Keeps `step` for backward(), which takes it if anything has been added to the gradient of its result. It is
+    // copied into the arena, so it may hold views and numbers only.
     template <class Step>
     void on_backward(Tensor<T> result, Step step) {
         static_assert(std::is_trivially_destructible_v<Step>);
@@ -1107,9 +1118,8 @@ template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
     const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
     const bool serial = static_cast<double>(rows) * work < 2e4;
-    compute.threads.run(
-        divide_up(rows, block),
-        [&](int task, int worker) { f(task * block, std::min(rows, (task + 1) * block), worker); }, serial);
+    const auto share = [&](int task, int worker) { f(task * block, std::min(rows, (task + 1) * block), worker); };
+    compute.threads.run(divide_up(rows, block), share, serial);
 }
 
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
@@ -1121,8 +1131,9 @@ void add_column_sums(Compute& compute, T* to, const T* from, int rows, int colum
     });
 }
 
-// Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its block
-// of rows_a_sum rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the next call.
+// Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its
+// block of rows_a_sum rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the
+// next call.
 constexpr int rows_a_sum = 64;
 template <class T, class F>
 const T* sums_of_blocks(Compute& compute, int rows, int columns, F&& f) {
@@ -1152,8 +1163,8 @@ struct Affine {
 };
 
 // What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
-// columns [begin, end) of a row y of the result, backward(dy, y, row, columns) turns that row's gradient, in place, into
-// the sum's; begin_backward() comes before that.
+// columns [begin, end) of a row y of the result, backward(dy, y, row, columns) turns that row's gradient, in place,
+// into the sum's; begin_backward() comes before that.
 struct Identity {
     void begin_backward() {}
     template <class T>
@@ -1202,16 +1213,13 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
-        const View<const T> dy = {y.gradient, count};
+        const View<const T> dy = {y.gradient, count}, in = {x.value, x.columns};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
                    x.rows, x.columns, count, next_store(x));
-        if (transposed)  // dW^T += dy^T x
-            matmul(compute, View<T>{dw, w.columns}, {y.gradient, count, true}, {x.value, x.columns}, count, x.columns,
-                   x.rows, Store::accumulate);
-        else  // dW += x^T dy
-            matmul(compute, View<T>{dw, w.columns}, {x.value, x.columns, true}, dy, x.columns, count, x.rows,
-                   Store::accumulate);
+        const auto [a, b] = transposed ? std::pair(dy, in) : std::pair(in, dy);  // dW^T += dy^T x, or dW += x^T dy
+        matmul(compute, View<T>{dw, w.columns}, {a.data, a.stride, true}, b, a.stride, b.stride, x.rows,
+               Store::accumulate);
     });
     return y;
 }
@@ -1389,26 +1397,28 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// to = or += sum_j weight_j row_j, for 16 Vectors columns, held in registers (where there are 32 of 64 bytes).
-template <int Vectors, class T>
+// to = or += sum_j weight_j row_j, for Width Vectors columns, held in registers (where there are enough).
+template <int Width, int Vectors, class T>
 ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride, int n,
                                Store store) {
-    typedef T Lanes __attribute__((vector_size(16 * sizeof(T))));
+    typedef T Lanes __attribute__((vector_size(Width * sizeof(T))));
     typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
     Lanes sum[Vectors] = {};
     for (int v = 0; store == Store::accumulate && v < Vectors; ++v)
-        sum[v] = *reinterpret_cast<const Unaligned*>(to + 16 * v);
+        sum[v] = *reinterpret_cast<const Unaligned*>(to + Width * v);
     for (int j = 0; j < n; ++j)
         for (int v = 0; v < Vectors; ++v)
-            sum[v] += weight[j * weight_stride] * *reinterpret_cast<const Unaligned*>(rows + j * stride + 16 * v);
-    for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Unaligned*>(to + 16 * v) = sum[v];
+            sum[v] += weight[j * weight_stride] * *reinterpret_cast<const Unaligned*>(rows + j * stride + Width * v);
+    for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Unaligned*>(to + Width * v) = sum[v];
 }
 
 // What attention does with rows [n, size]: y_j = scale (x . row_j), and the sum above.
 template <class T>
 EACH_TARGET void dot_rows(T* y, const T* x, const T* rows, int n, int size, T scale) {
     ptrdiff_t j = 0;
-    for (; j + 4 <= n; j += 4) dots<4>(y + j, x, rows + j * size, size, size);
+    for (; j + 4 <= n; j += 4)
+        wide_vectors ? dots<4, 16>(y + j, x, rows + j * size, size, size)
+                     : dots<4, 8>(y + j, x, rows + j * size, size, size);
     for (; j < n; ++j) y[j] = dot(x, rows + j * size, size);
     for (j = 0; j < n; ++j) y[j] *= scale;
 }
@@ -1417,15 +1427,17 @@ template <class T>
 EACH_TARGET void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows, int n,
                           int size, Store store) {
     int c = 0;
-    for (; c + 128 <= size; c += 128) add_rows_of<8>(to + c, weight, weight_stride, rows + c, size, n, store);
-    for (; c + 16 <= size; c += 16) add_rows_of<1>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; wide_vectors && c + 128 <= size; c += 128)
+        add_rows_of<16, 8>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; c + 64 <= size; c += 64) add_rows_of<8, 8>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; c + 16 <= size; c += 16) add_rows_of<8, 2>(to + c, weight, weight_stride, rows + c, size, n, store);
     if (store == Store::overwrite) std::fill(to + c, to + size, T(0));
     for (ptrdiff_t j = 0; j < n; ++j)
         for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * size + i];
 }
 
-// Rows [n, size] that lie `stride` apart, side by side: a row of the gym network's keys is 4 kB from the next, and a
-// cache keeps but eight or twelve lines of one address modulo 4 kB.
+// Copies rows [n, size] that lie `stride` apart side by side: the gym network's keys are 6 kB apart, 4 kB in its last
+// layer, and a cache holds only eight or twelve lines of the same address modulo 4 kB.
 template <class T>
 void gather_rows(T* to, const T* rows, ptrdiff_t stride, ptrdiff_t n, ptrdiff_t size) {
     for (ptrdiff_t j = 0; j < n; ++j) std::copy_n(rows + j * stride, size, to + j * size);
@@ -1440,8 +1452,8 @@ void softmax(T* x, int n) {
 }
 
 // Causal attention with `heads` heads, dropout on the weights, on packed sequences. Positions ascend within a span.
-// The queries are the first d columns of q [queries, ...], the keys and then the values the last 2 d of kv [tokens, ...],
-// which may be the same tensor; head h has columns h d/heads onwards of each. Query i stands at token position[i] of the
+// q [queries, d] and kv [tokens, 2 d], keys, then values; or both are one tensor [tokens, 3 d]: queries, keys, values.
+// Head h has columns h d/heads onwards of each. Every row lies in one span. Query i stands at token position[i] of the
 // whole batch and sees its own sequence up to and with itself. Returns [queries, d].
 template <class T>
 Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span* spans, int span_count,
@@ -1458,8 +1470,8 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span*
     T* d_weights = tape.template scratch<T>(tape.recording ? all : 0);
     Compute& compute = tape.compute;
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
-    const auto each_head = [=, &compute](int cost,
-                                         auto&& f) {  // f(span, head, room for `longest` rows of it, and numbers)
+    // f(span, head, room for the head's part of `longest` rows, room for `longest` numbers)
+    const auto each_head = [=, &compute](int cost, auto&& f) {
         for_rows(compute, span_count, cost, [=, &compute](int begin, int end, int worker) {
             Buffer& scratch = compute.scratch[static_cast<size_t>(worker)];
             T* const room = reinterpret_cast<T*>(scratch.room(static_cast<size_t>(longest * (size + 1)) * sizeof(T)));
@@ -2048,9 +2060,9 @@ inline double power(double x, uint64_t n) {
     return result;
 }
 
-// A tensor's share of the update: m, v and the step u (before the learning rate), from the clipped gradient.
+// m, v and the step u (before the learning rate) of n weights, from the clipped gradient.
 //   m = beta1 m + (1 - beta1) g;  v = beta2 v + (1 - beta2) g^2
-//   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon)
+//   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon), in LAMB + weight decay times value
 // Written over the gradient, which is not needed any more.
 EACH_TARGET inline void adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v,
                                   const float* __restrict value, size_t n, const OptimizerConfig& config, double scale,
@@ -2117,6 +2129,8 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
     const uint64_t t = ++optimizer.updates;
     const double bias1 = 1 - power(config.beta1, t), bias2 = 1 - power(config.beta2, t);
     const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
+    const bool adapt = lamb && (config.weight_decay != 0 || config.always_adapt);
+    const float shrink = lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
     optimizer.first_moment.resize(parameters.size());
     optimizer.second_moment.resize(parameters.size());
     for (size_t p = 0; p < parameters.size(); ++p) {
@@ -2125,17 +2139,13 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         const size_t n = parameter.value.size();
         m.resize(n);
         v.resize(n);
-        const bool adapt = lamb && (config.weight_decay != 0 || config.always_adapt);
         const size_t blocks = divide_up(n, square_block);
         std::vector<double> value_squares(blocks), step_squares(blocks);
         std::vector<unsigned char> bad(blocks);
         double trust = 1;
         const auto apply = [&](size_t block, size_t first, size_t count) {
-            const float rate = static_cast<float>(learning_rate * trust);
-            const float shrink =
-                lamb ? 1.0f : static_cast<float>(1 - learning_rate * config.weight_decay);  // AdamW's decay
-            float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
-            bad[block] = !apply_step(value, step, count, shrink, rate);
+            bad[block] = !apply_step(parameter.value.data() + first, parameter.gradient.data() + first, count, shrink,
+                                     static_cast<float>(learning_rate * trust));
         };
         for_blocks(compute, n, 16 * square_block, [&](size_t block, size_t first, size_t count) {
             float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;

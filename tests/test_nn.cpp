@@ -109,7 +109,7 @@ TEST(sixteen_counters_at_once_have_the_words_of_each) {
     for (uint32_t trial = 0; trial < 200; ++trial) {  // also where the counter wraps
         const Words4 counter = philox({trial, 1, 2, 3}, test_seed(), 0);
         const uint32_t first = trial % 2 == 0 ? counter[0] : 0xffffffff - trial % 16;
-        for (const auto sixteen : {philox_16, philox_16_anywhere}) {
+        for (const auto sixteen : {philox_16, philox_16_plain}) {
             uint32_t words[64];
             sixteen(words, {first, counter[1], counter[2], counter[3]}, trial, test_seed());
             for (uint32_t i = 0; i < 16; ++i) {
@@ -663,6 +663,12 @@ TEST(gradients_of_attention_equal_central_differences) {
                 };
                 gradients.check("attention of one tensor", build_of_one, {&qkv});
             }
+    Parameter<double> wide = leaf(draws, 8, 3 * 148);  // heads of 128 or 64 columns at a time, 16, and 4 more
+    const Build build = [&](Tape<double>& tape) {
+        return attention(tape, wide.tensor(), wide.tensor(), 148, all.data(), 3, everyone.data(), 1,
+                         dropout_of(tape, 0.3f));
+    };
+    gradients.check("attention of wide heads", build, {&wide}, 40);
 }
 
 TEST(gradients_of_the_heads_equal_central_differences) {
@@ -907,23 +913,48 @@ TEST(transformer_in_float_equals_a_plain_one_within_its_roundings) { check_again
 
 TEST(attention_equals_attention_plain) {
     Draws draws = {13};
-    constexpr int n = 7, d = 6;
-    const std::vector<double> q = draws.normals<double>(n * d), k = draws.normals<double>(n * d),
-                              v = draws.normals<double>(n * d);
-    std::vector<double> expected(n * d);
-    attention_plain(expected.data(), q.data(), k.data(), v.data(), n, d);
-    Tape<double> tape(serial());
-    const Tensor<double> queries = tape.make(n, d), kv = tape.make(n, 2 * d);
-    for (size_t i = 0; i < n; ++i)
-        for (size_t c = 0; c < d; ++c) {
-            queries.value[i * d + c] = q[i * d + c];
-            kv.value[i * 2 * d + c] = k[i * d + c];
-            kv.value[i * 2 * d + d + c] = v[i * d + c];
+    constexpr int n = 7;
+    for (const int d : {6, 19, 300}) {  // 300: columns by 128 or 64, by 16, and 12 more
+        const size_t width = static_cast<size_t>(d), size = n * width;
+        const std::vector<double> q = draws.normals<double>(size), k = draws.normals<double>(size),
+                                  v = draws.normals<double>(size);
+        std::vector<double> expected(size);
+        attention_plain(expected.data(), q.data(), k.data(), v.data(), n, d);
+        Tape<double> tape(serial());
+        const Tensor<double> queries = tape.make(n, d), kv = tape.make(n, 2 * d);
+        for (size_t i = 0; i < n; ++i)
+            for (size_t c = 0; c < width; ++c) {
+                queries.value[i * width + c] = q[i * width + c];
+                kv.value[i * 2 * width + c] = k[i * width + c];
+                kv.value[i * 2 * width + width + c] = v[i * width + c];
+            }
+        const Span span = {0, n, 0, n};
+        const int position[n] = {0, 1, 2, 3, 4, 5, 6};
+        const Tensor<double> out = attention(tape, queries, kv, d, &span, 1, position, 1, dropout_of(tape, 0));
+        for (size_t i = 0; i < size; ++i) CHECK_CLOSE(out.value[i], expected[i], 1e-14);
+    }
+}
+
+TEST(dots_add_in_the_order_that_they_say_alone_by_fours_and_in_both_widths) {
+    Draws draws = {16};
+    for (size_t n = 0; n < 70; ++n) {
+        const std::vector<float> x = draws.normals<float>(n), rows = draws.normals<float>(4 * n);
+        float by_16[4], by_8[4];
+        const ptrdiff_t stride = static_cast<ptrdiff_t>(n);
+        dots<4, 16>(by_16, x.data(), rows.data(), stride, stride);
+        dots<4, 8>(by_8, x.data(), rows.data(), stride, stride);
+        for (size_t r = 0; r < 4; ++r) {
+            const float* row = rows.data() + r * n;
+            float lane[16] = {}, rest = 0;
+            for (size_t i = 0; i < n / 16 * 16; ++i) lane[i % 16] += x[i] * row[i];
+            for (size_t i = n / 16 * 16; i < n; ++i) rest += x[i] * row[i];
+            for (size_t width = 8; width > 0; width /= 2)
+                for (size_t i = 0; i < width; ++i) lane[i] += lane[i + width];
+            CHECK_EQUAL(by_16[r], lane[0] + rest);
+            CHECK_EQUAL(by_8[r], lane[0] + rest);
+            CHECK_EQUAL(dot(x.data(), row, static_cast<int>(n)), lane[0] + rest);
         }
-    const Span span = {0, n, 0, n};
-    const int position[n] = {0, 1, 2, 3, 4, 5, 6};
-    const Tensor<double> out = attention(tape, queries, kv, d, &span, 1, position, 1, dropout_of(tape, 0));
-    for (size_t i = 0; i < n * d; ++i) CHECK_CLOSE(out.value[i], expected[i], 1e-14);
+    }
 }
 
 TEST(softmax_of_attention_survives_huge_scores) {
