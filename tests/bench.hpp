@@ -120,7 +120,7 @@ float burn_tiles(int64_t rounds) {
     return c[0];
 }
 
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
 __attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) { return burn_vectors<Float16, true>(rounds); }
 __attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) { return burn_vectors<Float8, true>(rounds); }
 #endif
@@ -129,7 +129,7 @@ __attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) { return bur
 double burn_rate(const Kernel& kernel) {
     float (*burn)(int64_t) = kernel.parts > 0 ? burn_tiles<TilesInSoftware> : burn_vectors<Float4, false>;
     double operations = kernel.parts > 0 ? 2.0 * 32 * 32 * 32 : 2.0 * burn_chains * kernel.tile_columns / 2;
-#ifdef FUSED_KERNELS
+#ifdef X86_KERNELS
     if (&kernel == &kernel_avx512) burn = burn_avx512;
     if (&kernel == &kernel_avx2) burn = burn_avx2;
     if (kernel.supported == amx_granted) burn = burn_tiles<TilesInAmx>;
