@@ -114,6 +114,14 @@ inline Words4 philox(const Words4& counter, uint32_t key0, uint32_t key1) {
 #define EACH_TARGET
 #endif
 
+// Whether vectors of 64 bytes fit a register. Where they do not, GCC 12 takes them apart in memory, ten times as slow
+// as vectors of 32.
+#ifdef X86_KERNELS
+inline const bool wide_vectors = __builtin_cpu_supports("x86-64-v4");
+#else
+constexpr bool wide_vectors = false;
+#endif
+
 // words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16.
 inline void philox_16_plain(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
     for (uint32_t i = 0; i < 16; ++i) {
@@ -134,7 +142,7 @@ __attribute__((target("arch=x86-64-v4"))) inline void philox_16_avx512(uint32_t*
     for (size_t i = 0; i < 16; ++i)
         for (size_t j = 0; j < 4; ++j) words[4 * i + j] = static_cast<uint32_t>(c[i / 8][j][i % 8]);
 }
-inline const auto philox_16 = __builtin_cpu_supports("x86-64-v4") ? philox_16_avx512 : philox_16_plain;
+inline const auto philox_16 = wide_vectors ? philox_16_avx512 : philox_16_plain;
 #else
 inline const auto philox_16 = philox_16_plain;
 #endif
@@ -916,14 +924,6 @@ void matmul(Compute& compute, View<double> c, View<const double> a, View<const d
     after(Block{0, M, 0, N});
 }
 
-// Whether vectors of 64 bytes fit a register. Where they do not, GCC 12 takes them apart in memory, ten times as slow
-// as vectors of 32.
-#ifdef X86_KERNELS
-inline const bool wide_vectors = __builtin_cpu_supports("avx512f");
-#else
-constexpr bool wide_vectors = false;
-#endif
-
 // y_r = x . row_r for up to four rows [n], `stride` apart. The order of additions: 16 lanes (Width of them a vector),
 // folded in a fixed tree, in which the rows share vectors, then what is left over: faster than one chain, and as
 // reproducible.
@@ -1004,7 +1004,7 @@ class Arena {
         while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) ++chunk_, used_ = 0;
         if (chunk_ == chunks_.size()) add_chunk(std::max(bytes, size_t{1} << 20));
         used_ += bytes;
-        return &chunks_[chunk_].lines[(used_ - bytes) / sizeof(Buffer::Line)];
+        return chunks_[chunk_].lines.get() + (used_ - bytes) / sizeof(Buffer::Line);
     }
     // Joins the chunks into one, or batches of ever new shapes would each leave theirs behind.
     void reset() {
