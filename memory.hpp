@@ -481,6 +481,18 @@ struct BoxTree {
         }
     }
 
+    // Sends for the leaves where n points would go, and for what leads there.
+    void send_for_leaves(const float* at, size_t n) const {
+        std::vector<uint32_t> node(n, root);
+        for (size_t level = top(); level > 0; --level)
+            for (size_t i = 0; i < n; ++i) {
+                const size_t lane = nearest_lane(level, node[i], at + i * dim, 0);
+                __builtin_prefetch(&levels[level].oldest[node[i]][lane]);
+                node[i] = levels[level].child[node[i]][lane];
+                send_for(level - 1, node[i]);
+            }
+    }
+
     struct Parting {
         float overlap = INFINITY, extent = -INFINITY;       // in the dimension of the plane
         size_t first = 0;                                   // lanes on its lower side
@@ -574,11 +586,28 @@ struct BoxTree {
         return sum;
     }
 
-    // One bit for each lane within reach.
-    [[gnu::always_inline]] static uint32_t within_reach(const Lanes<float>& distance, float reach) {
-        uint32_t mask = 0;
-        for (size_t i = 0; i < lanes; ++i) mask |= (distance[i] <= reach ? 1u : 0u) << i;
-        return mask;
+    // One bit for each lane of which it holds.
+    template <class Condition>
+    [[gnu::always_inline]] static uint32_t lanes_where(Condition holds) {
+        static constexpr auto bits = [] {  // a table, not a shift: vectors of old cannot shift by lanes
+            std::array<int32_t, lanes> table = {};
+            for (size_t i = 0; i < lanes; ++i) table[i] = 1 << i;
+            return table;
+        }();
+        int32_t mask = 0;
+#pragma GCC unroll 1
+        for (size_t i = 0; i < lanes; ++i) mask |= bits[i] & -static_cast<int32_t>(holds(i));
+        return static_cast<uint32_t>(mask);
+    }
+
+    // The lanes of the least distance, of those from `first` on. Distances are no less than 0, so their bits are in the
+    // same order, and of whole numbers GCC finds the least by vectors.
+    [[gnu::always_inline]] static uint32_t nearest_lanes(const Lanes<float>& distance, size_t first) {
+        const auto bits_of = [&](size_t i) { return std::bit_cast<int32_t>(distance[i]); };
+        int32_t least = std::numeric_limits<int32_t>::max();
+#pragma GCC unroll 1
+        for (size_t i = 0; i < lanes; ++i) least = i >= first && bits_of(i) < least ? bits_of(i) : least;
+        return lanes_where([&](size_t i) { return bits_of(i) == least; }) >> first << first;
     }
 
     // So that the node comes from memory while something else is done.
@@ -590,50 +619,67 @@ struct BoxTree {
 
     // Of the lanes from `first` on. Ties: the first.
     EACH_TARGET size_t nearest_lane(size_t level, size_t node, const float* point, size_t first) const {
-        const Lanes<float> distance = distances(level, node, point);
-        float least = INFINITY;
-        for (size_t i = first; i < lanes; ++i) least = std::min(least, distance[i]);
-        return static_cast<size_t>(std::countr_zero(within_reach(distance, least) >> first)) + first;
+        return static_cast<size_t>(std::countr_zero(nearest_lanes(distances(level, node, point), first)));
     }
 
-    struct Box {
-        float distance;
-        uint32_t node;  // in which it is a lane
-        uint16_t level, lane;
+    // A node on the way to where a search is.
+    struct Stage {
+        Lanes<float> distance;  // of its lanes; INFINITY: opened
+        size_t node, nearest;   // nearest: the lane to be opened next
     };
 
-    // A search under way: the node it has come to, and the boxes it has seen and not opened, the next one last.
+    // A search under way.
     struct Walk {
         Query* query;
-        float reach;  // what is farther does not count
-        size_t level, node;
-        std::vector<Box> unopened;
+        float reach;             // what is farther does not count
+        size_t level;            // where it is, at way[level]
+        std::vector<Stage> way;  // [level]
     };
 
     // The K nearest entries to each point, but only those nearer than `limit`. Several walks take turns, so that the
-    // next node of each comes from memory while the others compute.
+    // next node of each comes from memory while the others compute, and the processor has the distances of several
+    // under way: none of them waits for a branch that was foreseen wrongly, as what follows for each then does.
     EACH_TARGET void search(const Points& points, std::vector<Query>& queries, size_t K, float limit) const {
         std::vector<Walk> walks(std::min<size_t>(queries.size(), 16));
         size_t begun = 0;
         const auto begin = [&](Walk& walk) {
-            walk = {&queries[begun++], limit, top(), root, std::move(walk.unopened)};
+            walk = {&queries[begun++], limit, top(), std::move(walk.way)};
+            walk.way.resize(levels.size());
+            walk.way[walk.level].node = root;
         };
         for (Walk& walk : walks) begin(walk);
-        while (!walks.empty())
-            for (size_t i = 0; i < walks.size(); ++i) {
+        while (!walks.empty()) {
+            for (Walk& walk : walks) scan(walk);
+            for (size_t i = 0; i < walks.size();) {
                 Walk& walk = walks[i];
-                if (walk.level == 0)
-                    scan_leaf(points, walk, K);
-                else
-                    scan_boxes(walk);
-                if (open_next(points, walk, K)) continue;
-                if (begun < queries.size()) {
-                    begin(walk);
+                if (walk.level == 0) take_entries(points, walk, K);
+                if (open_next(points, walk, K)) {
+                    ++i;
+                } else if (begun < queries.size()) {
+                    begin(walk), ++i;
                 } else {
                     std::swap(walk, walks.back());
                     walks.pop_back();
                 }
             }
+        }
+    }
+
+    [[gnu::always_inline]] inline void scan(Walk& walk) const {
+        Stage& stage = walk.way[walk.level];
+        stage.distance = distances(walk.level, stage.node, walk.query->point);
+        find_nearest(walk.level, stage);
+    }
+
+    // Of equally near boxes the one with the oldest entry.
+    [[gnu::always_inline]] inline void find_nearest(size_t level, Stage& stage) const {
+        uint32_t nearest = nearest_lanes(stage.distance, 0);
+        stage.nearest = static_cast<size_t>(std::countr_zero(nearest));
+        while ((nearest &= nearest - 1) != 0 && level > 0) {
+            const Lanes<uint64_t>& oldest = levels[level].oldest[stage.node];
+            const auto lane = static_cast<size_t>(std::countr_zero(nearest));
+            if (oldest[lane] < oldest[stage.nearest]) stage.nearest = lane;
+        }
     }
 
     // Whether an entry, or a box whose oldest entry is that old, can be among the K nearest. At equal distances the
@@ -644,12 +690,15 @@ struct BoxTree {
         return walk.query->found == K && age < points.ages[walk.query->best[K - 1].entry];
     }
 
-    [[gnu::always_inline]] inline void scan_leaf(const Points& points, Walk& walk, size_t K) const {
+    [[gnu::always_inline]] inline void take_entries(const Points& points, Walk& walk, size_t K) const {
+        walk.level = 1;
+        const Stage& stage = walk.way[0];
+        if (stage.distance[stage.nearest] > walk.reach) return;  // as in most leaves
         Query& query = *walk.query;
-        const Lanes<float> distance = distances(0, walk.node, query.point);
-        for (uint32_t mask = within_reach(distance, walk.reach); mask != 0; mask &= mask - 1) {
+        for (uint32_t mask = lanes_where([&](size_t i) { return stage.distance[i] <= walk.reach; }); mask != 0;
+             mask &= mask - 1) {
             const size_t lane = static_cast<size_t>(std::countr_zero(mask));
-            const Neighbour next = {distance[lane], levels[0].child[walk.node][lane]};
+            const Neighbour next = {stage.distance[lane], levels[0].child[stage.node][lane]};
             if (next.entry == query.skipped || next.entry == no_entry) continue;
             if (!counts(points, walk, K, next.distance, points.ages[next.entry])) continue;
             size_t k = query.found < K ? query.found++ : K - 1;
@@ -659,34 +708,19 @@ struct BoxTree {
         }
     }
 
-    [[gnu::always_inline]] inline void scan_boxes(Walk& walk) const {
-        const Lanes<float> distance = distances(walk.level, walk.node, walk.query->point);
-        const auto oldest = [&](const Box& box) { return levels[box.level].oldest[box.node][box.lane]; };
-        const size_t first = walk.unopened.size();
-        for (uint32_t mask = within_reach(distance, walk.reach); mask != 0; mask &= mask - 1) {
-            const size_t lane = static_cast<size_t>(std::countr_zero(mask));
-            const Box box = {distance[lane], static_cast<uint32_t>(walk.node), static_cast<uint16_t>(walk.level),
-                             static_cast<uint16_t>(lane)};
-            const auto before = [&](const Box& other) {
-                return other.distance < box.distance || (other.distance == box.distance && oldest(other) < oldest(box));
-            };
-            size_t i = walk.unopened.size();
-            walk.unopened.push_back(box);
-            for (; i > first && before(walk.unopened[i - 1]); --i) walk.unopened[i] = walk.unopened[i - 1];
-            walk.unopened[i] = box;
-        }
-    }
-
     // Goes to the next box that counts, and sends for its node. Returns whether there is one.
     [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
-        while (!walk.unopened.empty()) {
-            const Box box = walk.unopened.back();
-            walk.unopened.pop_back();
-            const Level& above = levels[box.level];
-            if (!counts(points, walk, K, box.distance, above.oldest[box.node][box.lane])) continue;
-            walk.level = box.level - 1u;
-            walk.node = above.child[box.node][box.lane];
-            send_for(walk.level, walk.node);
+        for (; walk.level < levels.size(); ++walk.level) {
+            Stage& stage = walk.way[walk.level];
+            const Level& level = levels[walk.level];
+            const size_t lane = stage.nearest;
+            if (!counts(points, walk, K, stage.distance[lane], level.oldest[stage.node][lane])) continue;
+            const uint32_t node = level.child[stage.node][lane];
+#pragma GCC unroll 1
+            for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
+            find_nearest(walk.level, stage);
+            walk.way[--walk.level].node = node;
+            send_for(walk.level, node);
             return true;
         }
         return false;
@@ -804,10 +838,22 @@ struct EpisodicMemory {
         check_finite("actions", trajectory.actions.data(), T * A);
         check_finite("discounted returns", trajectory.discounted_returns.data(), T);
         Changes changes;
-        for (size_t t = 0; t < T; ++t)
+        for (size_t t = 0; t < T; ++t) {
+            if (t % 16 == 0) send_for(&trajectory.states[t * S], std::min<size_t>(16, T - t));
             update_one(changes, &trajectory.states[t * S], &trajectory.actions[t * A],
                        trajectory.discounted_returns[t]);
+        }
         return changes;
+    }
+
+    // So that what the updates of n states [n, state_dim] will touch comes from memory for all of them at once.
+    void send_for(const float* states, size_t n) const {
+        std::vector<float> at(n * dim);
+        for (size_t i = 0; i < n; ++i) {
+            project(states + i * S, &at[i * dim]);
+            __builtin_prefetch(&slots[state_key(states + i * S, S)[0] & (slots.size() - 1)]);
+        }
+        tree.send_for_leaves(at.data(), n);
     }
 
     // WODTEM eq. (4): Q(s) <- Q(s) if stored and e >= d; (s, a, d) if stored and e < d; (s, a, d) if not stored.

@@ -360,18 +360,26 @@ void bench_memory(Measurements& measured, size_t entries) {
     std::vector<float> states, asked;
     for (size_t i = 0; i < config.capacity + rounds * arrivals; ++i)
         for (uint32_t j = 0; j < 4; ++j) states.push_back(static_cast<float>(10 * random.uniform(i, j)));
-    const std::array<float, 8> action{};
-    EpisodicMemory::Changes changes;
     const float* next = states.data();
-    const auto insert = [&](size_t n) {
-        for (size_t i = 0; i < n; ++i, next += 4) memory.update_one(changes, next, action.data(), 1.0);
+    const auto take = [&](size_t n) {
+        Trajectory trajectory;
+        trajectory.states.assign(next, next + 4 * n);
+        trajectory.actions.resize(8 * n);
+        trajectory.rewards.resize(n);
+        trajectory.discounted_returns.resize(n);
+        next += 4 * n;
+        return trajectory;
     };
-    const double insertion = seconds_of([&] { insert(entries); });
-    const Spread arrival = timed(rounds, [&] { insert(arrivals); });
+    const Trajectory first = take(entries);
+    std::vector<Trajectory> arriving;
+    for (size_t i = 0; i < 2 * rounds + 1; ++i) arriving.push_back(take(arrivals));
+    const Trajectory* arrived = arriving.data();
+    const double insertion = seconds_of([&] { memory.update(first); });
+    const Spread arrival = timed(rounds, [&] { memory.update(*arrived++); });
     const double build =
         seconds_of([&] { memory.tree.build(memory.points(), 4, static_cast<uint32_t>(memory.size())); });
-    insert(1);  // the first eviction orders all entries
-    const Spread exchange = timed(rounds - 2, [&] { insert(arrivals); });
+    memory.update(*arrived++);  // the first eviction orders all entries
+    const Spread exchange = timed(rounds - 2, [&] { memory.update(*arrived++); });
     for (size_t i = 0, at = 0; i < 40 * queries; ++i) {
         at = (at + 7919) % entries;
         asked.insert(asked.end(), &states[4 * at], &states[4 * at + 4]);
