@@ -600,14 +600,16 @@ struct BoxTree {
         return static_cast<uint32_t>(mask);
     }
 
-    // The lanes of the least distance, of those from `first` on. Distances are no less than 0, so their bits are in the
-    // same order, and of whole numbers GCC finds the least by vectors.
-    [[gnu::always_inline]] static uint32_t nearest_lanes(const Lanes<float>& distance, size_t first) {
-        const auto bits_of = [&](size_t i) { return std::bit_cast<int32_t>(distance[i]); };
+    // The least distance, of the lanes from `first` on. Distances are no less than 0, so their bits are in the same order,
+    // and of whole numbers GCC finds the least by vectors.
+    [[gnu::always_inline]] static float least_of(const Lanes<float>& distance, size_t first) {
         int32_t least = std::numeric_limits<int32_t>::max();
 #pragma GCC unroll 1
-        for (size_t i = 0; i < lanes; ++i) least = i >= first && bits_of(i) < least ? bits_of(i) : least;
-        return lanes_where([&](size_t i) { return bits_of(i) == least; }) >> first << first;
+        for (size_t i = 0; i < lanes; ++i) {
+            const auto bits = std::bit_cast<int32_t>(distance[i]);
+            least = i >= first && bits < least ? bits : least;
+        }
+        return std::bit_cast<float>(least);
     }
 
     // So that the node comes from memory while something else is done.
@@ -619,13 +621,17 @@ struct BoxTree {
 
     // Of the lanes from `first` on. Ties: the first.
     EACH_TARGET size_t nearest_lane(size_t level, size_t node, const float* point, size_t first) const {
-        return static_cast<size_t>(std::countr_zero(nearest_lanes(distances(level, node, point), first)));
+        const Lanes<float> distance = distances(level, node, point);
+        const float least = least_of(distance, first);
+        const uint32_t nearest = lanes_where([&](size_t i) { return distance[i] == least; });
+        return static_cast<size_t>(std::countr_zero(nearest >> first)) + first;
     }
 
     // A node on the way to where a search is.
     struct Stage {
         Lanes<float> distance;  // of its lanes; INFINITY: opened
-        size_t node, nearest;   // nearest: the lane to be opened next
+        float least;            // of them
+        size_t node;
     };
 
     // A search under way.
@@ -668,18 +674,7 @@ struct BoxTree {
     [[gnu::always_inline]] inline void scan(Walk& walk) const {
         Stage& stage = walk.way[walk.level];
         stage.distance = distances(walk.level, stage.node, walk.query->point);
-        find_nearest(walk.level, stage);
-    }
-
-    // Of equally near boxes the one with the oldest entry.
-    [[gnu::always_inline]] inline void find_nearest(size_t level, Stage& stage) const {
-        uint32_t nearest = nearest_lanes(stage.distance, 0);
-        stage.nearest = static_cast<size_t>(std::countr_zero(nearest));
-        while ((nearest &= nearest - 1) != 0 && level > 0) {
-            const Lanes<uint64_t>& oldest = levels[level].oldest[stage.node];
-            const auto lane = static_cast<size_t>(std::countr_zero(nearest));
-            if (oldest[lane] < oldest[stage.nearest]) stage.nearest = lane;
-        }
+        stage.least = least_of(stage.distance, 0);
     }
 
     // Whether an entry, or a box whose oldest entry is that old, can be among the K nearest. At equal distances the
@@ -693,7 +688,7 @@ struct BoxTree {
     [[gnu::always_inline]] inline void take_entries(const Points& points, Walk& walk, size_t K) const {
         walk.level = 1;
         const Stage& stage = walk.way[0];
-        if (stage.distance[stage.nearest] > walk.reach) return;  // as in most leaves
+        if (stage.least > walk.reach) return;  // as in most leaves
         Query& query = *walk.query;
         for (uint32_t mask = lanes_where([&](size_t i) { return stage.distance[i] <= walk.reach; }); mask != 0;
              mask &= mask - 1) {
@@ -708,19 +703,25 @@ struct BoxTree {
         }
     }
 
-    // Goes to the next box that counts, and sends for its node. Returns whether there is one.
+    // Goes to the next box that counts, and sends for its node. Of equally near ones: the one with the oldest entry.
+    // Returns whether there is one.
     [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
         for (; walk.level < levels.size(); ++walk.level) {
             Stage& stage = walk.way[walk.level];
+            if (stage.least > walk.reach) continue;
             const Level& level = levels[walk.level];
-            const size_t lane = stage.nearest;
-            if (!counts(points, walk, K, stage.distance[lane], level.oldest[stage.node][lane])) continue;
+            const Lanes<uint64_t>& oldest = level.oldest[stage.node];
+            uint32_t nearest = lanes_where([&](size_t i) { return stage.distance[i] == stage.least; });
+            size_t lane = static_cast<size_t>(std::countr_zero(nearest));
+            while ((nearest &= nearest - 1) != 0)
+                if (const auto i = static_cast<size_t>(std::countr_zero(nearest)); oldest[i] < oldest[lane]) lane = i;
+            if (!counts(points, walk, K, stage.least, oldest[lane])) continue;
             const uint32_t node = level.child[stage.node][lane];
+            send_for(walk.level - 1, node);
 #pragma GCC unroll 1
             for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
-            find_nearest(walk.level, stage);
+            stage.least = least_of(stage.distance, 0);
             walk.way[--walk.level].node = node;
-            send_for(walk.level, node);
             return true;
         }
         return false;
