@@ -839,32 +839,30 @@ struct EpisodicMemory {
         check_finite("actions", trajectory.actions.data(), T * A);
         check_finite("discounted returns", trajectory.discounted_returns.data(), T);
         Changes changes;
-        for (size_t t = 0; t < T; ++t) {
-            if (t % 16 == 0) send_for(&trajectory.states[t * S], std::min<size_t>(16, T - t));
-            update_one(changes, &trajectory.states[t * S], &trajectory.actions[t * A],
-                       trajectory.discounted_returns[t]);
+        std::array<Words4, 16> key;
+        std::vector<float> point(key.size() * dim);
+        for (size_t first = 0; first < T; first += key.size()) {
+            const size_t n = std::min(key.size(), T - first);
+            for (size_t i = 0; i < n; ++i) {
+                key[i] = state_key(&trajectory.states[(first + i) * S], S);
+                project(&trajectory.states[(first + i) * S], &point[i * dim]);
+                __builtin_prefetch(&slots[key[i][0] & (slots.size() - 1)]);
+            }
+            tree.send_for_leaves(point.data(), n);
+            for (size_t i = 0, t = first; i < n; ++i, ++t)
+                update_one(changes, key[i], &point[i * dim], &trajectory.actions[t * A],
+                           trajectory.discounted_returns[t]);
         }
         return changes;
     }
 
-    // So that what the updates of n states [n, state_dim] will touch comes from memory for all of them at once.
-    void send_for(const float* states, size_t n) const {
-        std::vector<float> at(n * dim);
-        for (size_t i = 0; i < n; ++i) {
-            project(states + i * S, &at[i * dim]);
-            __builtin_prefetch(&slots[state_key(states + i * S, S)[0] & (slots.size() - 1)]);
-        }
-        tree.send_for_leaves(at.data(), n);
-    }
-
     // WODTEM eq. (4): Q(s) <- Q(s) if stored and e >= d; (s, a, d) if stored and e < d; (s, a, d) if not stored.
-    void update_one(Changes& changes, const float* state, const float* action, double d) {
-        const Words4 key = state_key(state, S);
+    void update_one(Changes& changes, const Words4& key, const float* point, const float* action, double d) {
         const uint32_t entry = slots[find_slot(key)];
         if (entry == no_entry) {
             ++changes.inserted;
             changes.evicted += size() == config.capacity;
-            return insert(key, state, action, d);
+            return insert(key, point, action, d);
         }
         count_access(entry);
         if (e[entry] < d) {
@@ -876,13 +874,11 @@ struct EpisodicMemory {
         }
     }
 
-    void insert(const Words4& key, const float* state, const float* action, double d) {
-        std::vector<float> point(dim);
-        project(state, point.data());
+    void insert(const Words4& key, const float* point, const float* action, double d) {
         const bool full = size() == config.capacity;
         const uint32_t entry = full ? evict() : append();
         set_row(keys, entry, key.data(), 4);
-        set_row(projected, entry, point.data(), dim);
+        set_row(projected, entry, point, dim);
         set_row(actions, entry, action, A);
         e[entry] = d;
         age[entry] = insertions++;

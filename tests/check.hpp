@@ -851,12 +851,18 @@ Table empty_table(Case& c) {
 }
 
 void take_in(Table& table, size_t row, EpisodicMemory::Changes& changes) {
-    const size_t S = table.memory.S, A = table.memory.A;
-    check_finite("states", &table.states.values[row * S], S);
-    check_finite("actions", &table.actions.values[row * A], A);
-    check_finite("e", &table.e.values[row], 1);
-    table.memory.update_one(changes, &table.states.values[row * S], &table.actions.values[row * A],
-                            table.e.values[row]);
+    const auto state = table.states.values.begin() + static_cast<ptrdiff_t>(row * table.memory.S),
+               action = table.actions.values.begin() + static_cast<ptrdiff_t>(row * table.memory.A);
+    Trajectory step;
+    step.states.assign(state, state + static_cast<ptrdiff_t>(table.memory.S));
+    step.actions.assign(action, action + static_cast<ptrdiff_t>(table.memory.A));
+    step.rewards = {0};
+    step.discounted_returns = {table.e.values[row]};
+    const EpisodicMemory::Changes now = table.memory.update(step);
+    changes.inserted += now.inserted;
+    changes.improved += now.improved;
+    changes.kept += now.kept;
+    changes.evicted += now.evicted;
 }
 
 Table full_table(Case& c) {
