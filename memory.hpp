@@ -457,6 +457,18 @@ struct BoxTree {
         put_entry(points, node, entry);
     }
 
+    // Sends for the leaves where these points would go, and for what leads there.
+    void send_for_leaves(const std::vector<const float*>& at) const {
+        std::vector<uint32_t> node(at.size(), root);
+        for (size_t level = top(); level > 0; --level)
+            for (size_t i = 0; i < at.size(); ++i) {
+                const size_t lane = nearest_lane(level, node[i], at[i], 0);
+                __builtin_prefetch(&levels[level].oldest[node[i]][lane]);
+                node[i] = levels[level].child[node[i]][lane];
+                send_for(level - 1, node[i]);
+            }
+    }
+
     // Makes two nodes, in the last two lanes, of the one in a lane: its lanes move where a plane parts them well, else
     // its entries are divided and both halves built anew.
     void split(const Points& points, size_t level, size_t node, size_t lane) {
@@ -479,18 +491,6 @@ struct BoxTree {
             put_node(points, level, node, build_node(points, level - 1, order.begin(), middle));
             put_node(points, level, node, build_node(points, level - 1, middle, order.end()));
         }
-    }
-
-    // Sends for the leaves where n points would go, and for what leads there.
-    void send_for_leaves(const float* at, size_t n) const {
-        std::vector<uint32_t> node(n, root);
-        for (size_t level = top(); level > 0; --level)
-            for (size_t i = 0; i < n; ++i) {
-                const size_t lane = nearest_lane(level, node[i], at + i * dim, 0);
-                __builtin_prefetch(&levels[level].oldest[node[i]][lane]);
-                node[i] = levels[level].child[node[i]][lane];
-                send_for(level - 1, node[i]);
-            }
     }
 
     struct Parting {
@@ -586,7 +586,7 @@ struct BoxTree {
         return sum;
     }
 
-    // One bit for each lane of which it holds.
+    // One bit for each lane of which `holds` is true.
     template <class Condition>
     [[gnu::always_inline]] static uint32_t lanes_where(Condition holds) {
         static constexpr auto bits = [] {  // a table, not a shift: vectors of old cannot shift by lanes
@@ -600,8 +600,8 @@ struct BoxTree {
         return static_cast<uint32_t>(mask);
     }
 
-    // The least distance, of the lanes from `first` on. Distances are no less than 0, so their bits are in the same order,
-    // and of whole numbers GCC finds the least by vectors.
+    // The least of the distances from lane `first` on. None is negative, so their bits, read as whole numbers, are in
+    // the same order; of those GCC finds the least by vectors.
     [[gnu::always_inline]] static float least_of(const Lanes<float>& distance, size_t first) {
         int32_t least = std::numeric_limits<int32_t>::max();
 #pragma GCC unroll 1
@@ -627,9 +627,9 @@ struct BoxTree {
         return static_cast<size_t>(std::countr_zero(nearest >> first)) + first;
     }
 
-    // A node on the way to where a search is.
+    // A node on the way from the root to where a search is, and what it has not yet opened there.
     struct Stage {
-        Lanes<float> distance;  // of its lanes; INFINITY: opened
+        Lanes<float> distance;  // of its lanes; INFINITY: opened, or empty, or too far for a float; none is ever opened
         float least;            // of them
         size_t node;
     };
@@ -643,8 +643,8 @@ struct BoxTree {
     };
 
     // The K nearest entries to each point, but only those nearer than `limit`. Several walks take turns, so that the
-    // next node of each comes from memory while the others compute, and the processor has the distances of several
-    // under way: none of them waits for a branch that was foreseen wrongly, as what follows for each then does.
+    // next node of each comes from memory while the others compute. All of them scan before any decides: no branch in a
+    // scan depends on what is found, so that one foreseen wrongly costs no distances.
     EACH_TARGET void search(const Points& points, std::vector<Query>& queries, size_t K, float limit) const {
         std::vector<Walk> walks(std::min<size_t>(queries.size(), 16));
         size_t begun = 0;
@@ -686,7 +686,7 @@ struct BoxTree {
     }
 
     [[gnu::always_inline]] inline void take_entries(const Points& points, Walk& walk, size_t K) const {
-        walk.level = 1;
+        walk.level = 1;  // back to the node above; past the end if the leaf is the root
         const Stage& stage = walk.way[0];
         if (stage.least > walk.reach) return;  // as in most leaves
         Query& query = *walk.query;
@@ -703,8 +703,8 @@ struct BoxTree {
         }
     }
 
-    // Goes to the next box that counts, and sends for its node. Of equally near ones: the one with the oldest entry.
-    // Returns whether there is one.
+    // Goes to the next box that counts, and sends for its node. Of equally near ones it is the one with the oldest
+    // entry: if that does not count, none of them does. Returns whether there is one.
     [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
         for (; walk.level < levels.size(); ++walk.level) {
             Stage& stage = walk.way[walk.level];
@@ -718,7 +718,7 @@ struct BoxTree {
             if (!counts(points, walk, K, stage.least, oldest[lane])) continue;
             const uint32_t node = level.child[stage.node][lane];
             send_for(walk.level - 1, node);
-#pragma GCC unroll 1
+#pragma GCC unroll 1  // all of it: one number stored into a vector makes the next who reads that wait
             for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
             stage.least = least_of(stage.distance, 0);
             walk.way[--walk.level].node = node;
@@ -839,8 +839,11 @@ struct EpisodicMemory {
         check_finite("actions", trajectory.actions.data(), T * A);
         check_finite("discounted returns", trajectory.discounted_returns.data(), T);
         Changes changes;
+        // Sixteen states at a time: what they will touch comes from memory for all of them at once. No more than a
+        // hint: one may be evicted before its turn, or another change the leaf where it will go.
         std::array<Words4, 16> key;
         std::vector<float> point(key.size() * dim);
+        std::vector<const float*> unknown;
         for (size_t first = 0; first < T; first += key.size()) {
             const size_t n = std::min(key.size(), T - first);
             for (size_t i = 0; i < n; ++i) {
@@ -848,7 +851,10 @@ struct EpisodicMemory {
                 project(&trajectory.states[(first + i) * S], &point[i * dim]);
                 __builtin_prefetch(&slots[key[i][0] & (slots.size() - 1)]);
             }
-            tree.send_for_leaves(point.data(), n);
+            unknown.clear();
+            for (size_t i = 0; i < n; ++i)
+                if (slots[find_slot(key[i])] == no_entry) unknown.push_back(&point[i * dim]);
+            tree.send_for_leaves(unknown);
             for (size_t i = 0, t = first; i < n; ++i, ++t)
                 update_one(changes, key[i], &point[i * dim], &trajectory.actions[t * A],
                            trajectory.discounted_returns[t]);
@@ -857,6 +863,7 @@ struct EpisodicMemory {
     }
 
     // WODTEM eq. (4): Q(s) <- Q(s) if stored and e >= d; (s, a, d) if stored and e < d; (s, a, d) if not stored.
+    // key: state_key of s; point: s projected.
     void update_one(Changes& changes, const Words4& key, const float* point, const float* action, double d) {
         const uint32_t entry = slots[find_slot(key)];
         if (entry == no_entry) {
