@@ -688,7 +688,7 @@ struct BoxTree {
     [[gnu::always_inline]] inline void take_entries(const Points& points, Walk& walk, size_t K) const {
         walk.level = 1;  // back to the node above; past the end if the leaf is the root
         const Stage& stage = walk.way[0];
-        if (stage.least > walk.reach) return;  // as in most leaves
+        if (!(stage.least <= walk.reach)) return;  // as in most leaves
         Query& query = *walk.query;
         for (uint32_t mask = lanes_where([&](size_t i) { return stage.distance[i] <= walk.reach; }); mask != 0;
              mask &= mask - 1) {
@@ -708,7 +708,7 @@ struct BoxTree {
     [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
         for (; walk.level < levels.size(); ++walk.level) {
             Stage& stage = walk.way[walk.level];
-            if (stage.least > walk.reach) continue;
+            if (!(stage.least <= walk.reach)) continue;  // NaN: the point is infinite, and nothing near it
             const Level& level = levels[walk.level];
             const Lanes<uint64_t>& oldest = level.oldest[stage.node];
             uint32_t nearest = lanes_where([&](size_t i) { return stage.distance[i] == stage.least; });
