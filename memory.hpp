@@ -718,7 +718,7 @@ struct BoxTree {
             if (!counts(points, walk, K, stage.least, oldest[lane])) continue;
             const uint32_t node = level.child[stage.node][lane];
             send_for(walk.level - 1, node);
-#pragma GCC unroll 1  // all of it: one number stored into a vector makes the next who reads that wait
+#pragma GCC unroll 1  // the whole vector: after a store of one lane, loading the vector would wait for it
             for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
             stage.least = least_of(stage.distance, 0);
             walk.way[--walk.level].node = node;
