@@ -291,7 +291,14 @@ struct BoxTree {
         const Lanes<uint32_t>& list = levels[level].child[node];
         return static_cast<size_t>(std::find(list.begin(), list.end(), what) - list.begin());
     }
-    size_t used(size_t level, size_t node) const { return lane_of(level, node, no_entry); }
+    // Counted, not found: vector code; it waits for a lane that has just been stored.
+    size_t used(size_t level, size_t node) const {
+        const Lanes<uint32_t>& list = levels[level].child[node];
+        uint32_t count = 0;
+#pragma GCC unroll 1
+        for (size_t i = 0; i < lanes; ++i) count += list[i] != no_entry;
+        return count;
+    }
 
     // ---- nodes and lanes
 
@@ -343,14 +350,12 @@ struct BoxTree {
         clear_lane(level, node, last);
     }
 
-    void put_entry(const Points& points, size_t leaf, uint32_t entry) {
-        const size_t lane = used(0, leaf);
+    void put_entry(const Points& points, size_t leaf, size_t lane, uint32_t entry) {
         set_child(0, leaf, lane, entry);
         for (size_t d = 0; d < dim; ++d) low(0, leaf, d)[lane] = points.rows[entry * dim + d];
     }
 
-    void put_node(const Points& points, size_t level, size_t node, uint32_t below) {
-        const size_t lane = used(level, node);
+    void put_node(const Points& points, size_t level, size_t node, size_t lane, uint32_t below) {
         set_child(level, node, lane, below);
         enclose(points, level, node, lane);
     }
@@ -391,23 +396,25 @@ struct BoxTree {
     uint32_t build_node(const Points& points, size_t level, Iterator begin, Iterator end) {
         const uint32_t node = add_node(level);
         if (level == 0) {
-            for (auto i = begin; i != end; ++i) put_entry(points, node, i->second);
+            for (auto i = begin; i != end; ++i) put_entry(points, node, static_cast<size_t>(i - begin), i->second);
             return node;
         }
         size_t room = 1;  // in a comfortable node of the level below
         for (size_t i = 0; i < level; ++i) room *= comfortable;
         const size_t n = static_cast<size_t>(end - begin);  // at most half of 16^(level + 1), or else all there is
-        build_lanes(points, level, node, std::clamp((n + room - 1) / room, fewest, lanes - 1), begin, end);
+        build_lanes(points, level, node, 0, std::clamp((n + room - 1) / room, fewest, lanes - 1), begin, end);
         return node;
     }
 
-    void build_lanes(const Points& points, size_t level, uint32_t node, size_t count, Iterator begin, Iterator end) {
-        if (count == 1) return put_node(points, level, node, build_node(points, level - 1, begin, end));
+    // `count` lanes from `lane` on.
+    void build_lanes(const Points& points, size_t level, uint32_t node, size_t lane, size_t count, Iterator begin,
+                     Iterator end) {
+        if (count == 1) return put_node(points, level, node, lane, build_node(points, level - 1, begin, end));
         const Iterator middle =
             begin + (end - begin) * static_cast<ptrdiff_t>(count / 2) / static_cast<ptrdiff_t>(count);
         cut(points, begin, middle, end);
-        build_lanes(points, level, node, count / 2, begin, middle);
-        build_lanes(points, level, node, count - count / 2, middle, end);
+        build_lanes(points, level, node, lane, count / 2, begin, middle);
+        build_lanes(points, level, node, lane + count / 2, count - count / 2, middle, end);
     }
 
     // Entries before `middle` get the lower coordinates in the widest dimension.
@@ -435,7 +442,7 @@ struct BoxTree {
             levels.emplace_back();
             const uint32_t below = root;
             root = add_node(top());
-            put_node(points, top(), root, below);
+            put_node(points, top(), root, 0, below);
         }
         uint32_t node = root;
         for (size_t level = top(); level > 0; --level) {
@@ -454,7 +461,7 @@ struct BoxTree {
             oldest = std::min(oldest, points.ages[entry]);
             node = child(level, node)[lane];
         }
-        put_entry(points, node, entry);
+        put_entry(points, node, used(0, node), entry);
     }
 
     // Sends for the leaves where these points would go, and for what leads there.
@@ -473,23 +480,25 @@ struct BoxTree {
     // its entries are divided and both halves built anew.
     void split(const Points& points, size_t level, size_t node, size_t lane) {
         const uint32_t below = child(level, node)[lane];
+        for (size_t i = 0; level == 1 && i < lanes; ++i) __builtin_prefetch(&points.ages[child(0, below)[i]]);
         erase_lane(level, node, lane);
+        const size_t next = used(level, node);
         const Parting parting = best_parting(level - 1, below);
         if (parting.overlap <= tolerance) {
             const uint32_t halves[2] = {add_node(level - 1), add_node(level - 1)};
             for (size_t i = 0; i < lanes; ++i) {
-                const uint32_t half = halves[i >= parting.first];
-                move_lane(level - 1, below, parting.order[i].second, half, used(level - 1, half));
+                const bool upper = i >= parting.first;
+                move_lane(level - 1, below, parting.order[i].second, halves[upper], upper ? i - parting.first : i);
             }
             release(level - 1, below);
-            for (const uint32_t half : halves) put_node(points, level, node, half);
+            for (size_t half = 0; half < 2; ++half) put_node(points, level, node, next + half, halves[half]);
         } else {
             Order order;
             take_apart(level - 1, below, order);
             const Iterator middle = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
             cut(points, order.begin(), middle, order.end());
-            put_node(points, level, node, build_node(points, level - 1, order.begin(), middle));
-            put_node(points, level, node, build_node(points, level - 1, middle, order.end()));
+            put_node(points, level, node, next, build_node(points, level - 1, order.begin(), middle));
+            put_node(points, level, node, next + 1, build_node(points, level - 1, middle, order.end()));
         }
     }
 
@@ -532,7 +541,7 @@ struct BoxTree {
 
     // Appends the entries below a node, and gives up the nodes.
     void take_apart(size_t level, uint32_t node, Order& order) {
-        for (size_t lane = 0; lane < used(level, node); ++lane) {
+        for (size_t lane = 0, end = used(level, node); lane < end; ++lane) {
             const uint32_t what = child(level, node)[lane];
             if (level == 0) order.push_back({0.0f, what});
             if (level > 0) take_apart(level - 1, what, order);
@@ -600,15 +609,12 @@ struct BoxTree {
         return static_cast<uint32_t>(mask);
     }
 
-    // The least of the distances from lane `first` on. None is negative, so their bits, read as whole numbers, are in
-    // the same order; of those GCC finds the least by vectors.
-    [[gnu::always_inline]] static float least_of(const Lanes<float>& distance, size_t first) {
+    // The least of the distances. None is negative, so their bits, read as whole numbers, are in the same order; of
+    // those GCC finds the least by vectors.
+    [[gnu::always_inline]] static float least_of(const Lanes<float>& distance) {
         int32_t least = std::numeric_limits<int32_t>::max();
 #pragma GCC unroll 1
-        for (size_t i = 0; i < lanes; ++i) {
-            const auto bits = std::bit_cast<int32_t>(distance[i]);
-            least = i >= first && bits < least ? bits : least;
-        }
+        for (size_t i = 0; i < lanes; ++i) least = std::min(least, std::bit_cast<int32_t>(distance[i]));
         return std::bit_cast<float>(least);
     }
 
@@ -621,8 +627,10 @@ struct BoxTree {
 
     // Of the lanes from `first` on. Ties: the first.
     EACH_TARGET size_t nearest_lane(size_t level, size_t node, const float* point, size_t first) const {
-        const Lanes<float> distance = distances(level, node, point);
-        const float least = least_of(distance, first);
+        Lanes<float> distance = distances(level, node, point);
+#pragma GCC unroll 1
+        for (uint32_t i = 0; i < lanes; ++i) distance[i] = i < static_cast<uint32_t>(first) ? INFINITY : distance[i];
+        const float least = least_of(distance);
         const uint32_t nearest = lanes_where([&](size_t i) { return distance[i] == least; });
         return static_cast<size_t>(std::countr_zero(nearest >> first)) + first;
     }
@@ -674,7 +682,7 @@ struct BoxTree {
     [[gnu::always_inline]] inline void scan(Walk& walk) const {
         Stage& stage = walk.way[walk.level];
         stage.distance = distances(walk.level, stage.node, walk.query->point);
-        stage.least = least_of(stage.distance, 0);
+        stage.least = least_of(stage.distance);
     }
 
     // Whether an entry, or a box whose oldest entry is that old, can be among the K nearest. At equal distances the
@@ -720,7 +728,7 @@ struct BoxTree {
             send_for(walk.level - 1, node);
 #pragma GCC unroll 1  // the whole vector: after a store of one lane, loading the vector would wait for it
             for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
-            stage.least = least_of(stage.distance, 0);
+            stage.least = least_of(stage.distance);
             walk.way[--walk.level].node = node;
             return true;
         }
