@@ -259,9 +259,9 @@ struct BoxTree {
     static constexpr size_t lanes = 16;
     static constexpr size_t fewest = 4;        // lanes in use, but for the root; those in use come first
     static constexpr size_t comfortable = 12;  // lanes in use after building: room for more
-    // Two halves of a node may overlap by this part of its extent. None at all: insertion takes twice as long, because
-    // more is built anew. 0.1: a look-up takes a third longer.
-    static constexpr float tolerance = 0.02f;
+    // Two halves of a node may overlap by this part of its extent. None at all: insertion takes two and a half times as
+    // long, because more is built anew. 0.04: a look-up takes a quarter longer.
+    static constexpr float tolerance = 0.01f;
 
     template <class Number>
     struct alignas(64) Lanes : std::array<Number, lanes> {};
@@ -380,7 +380,8 @@ struct BoxTree {
 
     // ---- building
 
-    using Order = std::vector<std::pair<float, uint32_t>>;  // (coordinate to cut by, entry)
+    using Ranked = std::pair<float, uint32_t>;
+    using Order = std::vector<Ranked>;  // (coordinate to cut by, entry)
     using Iterator = Order::iterator;
 
     // A tree of the table's first n entries.
@@ -481,9 +482,9 @@ struct BoxTree {
     void split(const Points& points, size_t level, size_t node, size_t lane) {
         const uint32_t below = child(level, node)[lane];
         for (size_t i = 0; level == 1 && i < lanes; ++i) __builtin_prefetch(&points.ages[child(0, below)[i]]);
+        const Parting parting = best_parting(level, node, lane);
         erase_lane(level, node, lane);
         const size_t next = used(level, node);
-        const Parting parting = best_parting(level - 1, below);
         if (parting.overlap <= tolerance) {
             const uint32_t halves[2] = {add_node(level - 1), add_node(level - 1)};
             for (size_t i = 0; i < lanes; ++i) {
@@ -503,32 +504,35 @@ struct BoxTree {
     }
 
     struct Parting {
-        float overlap = INFINITY, extent = -INFINITY;       // in the dimension of the plane
-        size_t first = 0;                                   // lanes on its lower side
-        std::array<std::pair<float, size_t>, lanes> order;  // (centre, lane)
+        float overlap = INFINITY;         // part of the extent in the dimension of the plane
+        size_t first = 0;                 // lanes on its lower side
+        std::array<Ranked, lanes> order;  // (centre, lane)
     };
 
-    // Of the planes that leave enough lanes on both sides: a tolerable or else the least overlap, then the widest
-    // dimension, then the most even halves.
-    Parting best_parting(size_t level, size_t node) {
+    // Of the planes that part the node in a lane and leave enough of its lanes on both sides: a tolerable or else the
+    // least overlap, then the widest dimension, then the most even halves.
+    Parting best_parting(size_t level, size_t node, size_t lane) {
+        const uint32_t below = child(level, node)[lane];
+        std::vector<Ranked> widest;  // dimensions, by minus their extent
+        for (uint32_t d = 0; d < dim; ++d)
+            widest.push_back({low(level, node, d)[lane] - high(level, node, d)[lane], d});
+        std::sort(widest.begin(), widest.end());
         Parting best;
-        for (size_t d = 0; d < dim; ++d) {
-            const Lanes<float>&lows = low(level, node, d), &highs = high(level, node, d);
+        for (size_t w = 0; w < dim && widest[w].first < 0.0f && best.overlap > tolerance; ++w) {
+            const size_t d = widest[w].second;
+            const Lanes<float>&lows = low(level - 1, below, d), &highs = high(level - 1, below, d);
             Parting next;
-            for (size_t i = 0; i < lanes; ++i) next.order[i] = {0.5f * lows[i] + 0.5f * highs[i], i};
+            for (uint32_t i = 0; i < lanes; ++i) next.order[i] = {0.5f * lows[i] + 0.5f * highs[i], i};
             std::sort(next.order.begin(), next.order.end());
             Lanes<float> most = {}, least = {};  // of the lanes up to i, of those from i on
             for (size_t i = 0; i < lanes; ++i)
                 most[i] = std::max(highs[next.order[i].second], i > 0 ? most[i - 1] : -INFINITY);
             for (size_t i = lanes; i-- > 0;)
                 least[i] = std::min(lows[next.order[i].second], i + 1 < lanes ? least[i + 1] : INFINITY);
-            next.extent = most[lanes - 1] - least[0];
-            if (!(next.extent > 0.0f)) continue;
             for (size_t i = 0; i <= lanes - 2 * fewest; ++i) {  // 8, 7, 9, 6, 10 ...
                 next.first = i % 2 ? lanes / 2 - (i + 1) / 2 : lanes / 2 + i / 2;
-                next.overlap = std::max(tolerance, (most[next.first - 1] - least[next.first]) / next.extent);
-                if (next.overlap < best.overlap || (next.overlap == best.overlap && next.extent > best.extent))
-                    best = next;
+                next.overlap = std::max(tolerance, (most[next.first - 1] - least[next.first]) / -widest[w].first);
+                if (next.overlap < best.overlap) best = next;
             }
         }
         return best;
