@@ -1,7 +1,8 @@
 // nn.hpp: everything numerical that a decision transformer needs, and nothing about reinforcement learning.
 //
-// In order: errors; random numbers by counter; worker threads; matrix products; tensors and the tape; the operations of
-// the network, each with its backward; the decision transformer (DT, ODT sec. 3); policy heads; optimisers.
+// In order: errors; random numbers by counter; worker threads; matrix products: what they are, the kernels for a tile of
+// one, how one is shared out; tensors and the tape; the operations of the network, each with its backward; the decision
+// transformer (DT, ODT sec. 3); policy heads; optimisers.
 // Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
 // number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
 // Leaves out: anything that knows what a return, an episode or a file is.
@@ -368,6 +369,9 @@ inline void matmul_parts_plain(View<float> c, View<const float> a, View<const fl
                     }
         }
 }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Kernels. What computes one tile of a product, for each instruction set and precision.
 
 // One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns] (row stride b_stride), depth <=
 // kernel.depth. Writes (`add`: adds) the upper left rows x columns of the tile to c.
@@ -753,6 +757,9 @@ inline const Kernel& choose_kernel(const std::string& name, const std::string& p
          "this machine cannot compute in %s with kernel %s; it has: %s (portable imitates a matrix unit, slowly)",
          precision.c_str(), name.c_str(), available.c_str());
 }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Products from tiles: packing and sharing out.
 
 // Scratch memory on cache lines (a vector load that straddles two costs two), grown to what was once asked for. What is
 // in it lasts until room() is called again.
