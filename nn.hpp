@@ -373,10 +373,10 @@ inline void matmul_parts_plain(View<float> c, View<const float> a, View<const fl
 // ---------------------------------------------------------------------------------------------------------------------
 // Kernels. What computes one tile of a product, for each instruction set and precision.
 
-// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns] (row stride b_stride), depth <=
-// kernel.depth. Writes (`add`: adds) the upper left rows x columns of the tile to c.
-using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int b_stride, int depth, int rows,
-                              int columns, bool add);
+// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns], depth <= kernel.depth. Writes (`add`:
+// adds) the upper left rows x columns of the tile to c.
+using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int depth, int rows, int columns,
+                              bool add);
 
 // Copies `used` lines of `depth` elements into a panel, filling up with zeros; element (k, w) of the panel comes from
 // view(k, w) offset by (first_k, first_w). Lines are rows of A or columns of B.
@@ -418,8 +418,8 @@ ALWAYS_INLINE void multiply_add(Vector& sum, const Vector& a, const Vector& b) {
 }
 
 template <class Vector, int Rows, int Vectors, bool Fused>
-ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float* b, int b_stride, int depth, int rows,
-                             int columns, bool add) {
+ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float* b, int depth, int rows, int columns,
+                             bool add) {
     typedef Vector Unaligned __attribute__((aligned(4), may_alias));
     constexpr int lanes = sizeof(Vector) / sizeof(float), tile_columns = lanes * Vectors;
     for (int r = 0; r < rows; ++r)  // C may be far away, and is wanted only at the end
@@ -430,7 +430,7 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
 #pragma GCC unroll 4
         for (int v = 0; v < Vectors; ++v) {
             row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
-            __builtin_prefetch(b + ptrdiff_t{16} * b_stride + v * lanes);  // for a B that lies far away, unpacked
+            __builtin_prefetch(b + 16 * tile_columns + v * lanes);
         }
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r) {
@@ -439,7 +439,7 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
             for (int v = 0; v < Vectors; ++v) multiply_add<Fused>(sum[r][v], element_of_a, row_of_b[v]);
         }
         a += Rows;
-        b += b_stride;
+        b += tile_columns;
     }
     if (rows == Rows && columns == tile_columns) {
 #pragma GCC unroll 16
@@ -500,13 +500,13 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_w, int
 }
 
 // A kernel for each instruction set: the same body, another vector, compiled for its own target.
-#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                               \
-    TARGET inline void tile_##NAME(float* c, int c_stride, const void* a, const void* b, int b_stride, int depth,   \
-                                   int rows, int columns, bool add) {                                               \
-        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, static_cast<const float*>(a),                          \
-                                                static_cast<const float*>(b), b_stride, depth, rows, columns, add); \
-    }                                                                                                               \
-    inline const Kernel kernel_##NAME = vector_kernel<ROWS, VECTORS * sizeof(VECTOR) / sizeof(float)>(              \
+#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                         \
+    TARGET inline void tile_##NAME(float* c, int c_stride, const void* a, const void* b, int depth, int rows, \
+                                   int columns, bool add) {                                                   \
+        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, static_cast<const float*>(a),                    \
+                                                static_cast<const float*>(b), depth, rows, columns, add);     \
+    }                                                                                                         \
+    inline const Kernel kernel_##NAME = vector_kernel<ROWS, VECTORS * sizeof(VECTOR) / sizeof(float)>(        \
         #NAME, FUSED ? "fused" : "plain", [] { return static_cast<bool>(SUPPORTED); }, tile_##NAME);
 
 template <int Rows, int Columns>
@@ -679,8 +679,8 @@ inline bool amx_granted() {
 #endif
 
 template <class Tiles, int Parts>
-void tile_of_parts(float* c, int c_stride, const void* a_panel, const void* b_panel, int, int depth, int rows,
-                   int columns, bool add) {
+void tile_of_parts(float* c, int c_stride, const void* a_panel, const void* b_panel, int depth, int rows, int columns,
+                   bool add) {
     const uint16_t *a = static_cast<const uint16_t*>(a_panel), *b = static_cast<const uint16_t*>(b_panel);
     alignas(64) float whole[part_lines * part_lines];  // where the tile sticks out of C
     const bool inside = rows == part_lines && columns == part_lines;
@@ -828,7 +828,7 @@ inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char
 }
 
 // The product of a block of rows with panels of B, for one step of k.
-inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a, View<const float> b,
+inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
     char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, kernel.depth()));
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
@@ -843,10 +843,9 @@ inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, V
                 block.end_row);
     kernel.prepare(true);
     for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns) {
-        const void* panel_b = &b(first_k, j);
-        if (packed_b) panel_b = packed_b + static_cast<size_t>(j / kernel.tile_columns) * b_panel;
+        const char* const panel_b = packed_b + static_cast<size_t>(j / kernel.tile_columns) * b_panel;
         tiles([&](char* panel, int i, int rows) {
-            kernel.tile(&c(i, j), c.stride, panel, panel_b, packed_b ? kernel.tile_columns : b.stride, depth, rows,
+            kernel.tile(&c(i, j), c.stride, panel, panel_b, depth, rows,
                         std::min(kernel.tile_columns, block.end_column - j), add);
         });
     }
@@ -857,9 +856,8 @@ struct Nothing {
     void operator()(const Block&) const {}
 };
 
-// The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles. Up
-// to four tiles of rows (acting) read B where it lies, 1.4 times as fast at four: packing it would cost as much as the
-// product. after(block) is called for every part of C after its last addition, while it is in a core's cache.
+// The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles.
+// after(block) is called for every part of C after its last addition, while it is in a core's cache.
 template <class After = Nothing>
 void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
             After after = {}) {
@@ -869,7 +867,6 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
         return after(Block{0, M, 0, N});
     }
     const Kernel& kernel = compute.kernel;
-    const bool pack_b = kernel.parts > 0 || M > 4 * kernel.tile_rows || b.transposed || N % kernel.tile_columns != 0;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
@@ -879,19 +876,18 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
     const int depth = kernel.depth();
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
-    Compute::Kept* const kept =
-        pack_b && b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.transposed, K, N}] : nullptr;
+    Compute::Kept* const kept = b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.transposed, K, N}] : nullptr;
     const int all_steps = divide_up(K, depth), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
               steps = kept ? all_steps : std::clamp(fitting, 1, all_steps);
     Buffer& buffer = kept ? kept->packed : compute.packed_b;
-    char* const packed = pack_b ? buffer.room(step_bytes * static_cast<size_t>(steps)) : nullptr;
+    char* const packed = buffer.room(step_bytes * static_cast<size_t>(steps));
     const bool packed_before = kept && std::exchange(kept->period, compute.period) == compute.period;
     const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
     for (int first_k = 0; first_k < K; first_k += steps * depth) {
         const int end_k = std::min(K, first_k + steps * depth);
         const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
         const int at_once = std::max(1, panels / 8), batches = divide_up(panels, at_once);  // panels that a task packs
-        if (pack_b && !packed_before)
+        if (!packed_before)
             compute.threads.run(
                 divide_up(end_k - first_k, depth) * batches,
                 [&](int task, int) {
@@ -912,8 +908,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
                 };
                 const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
                 for (int k = first_k; k < end_k; k += depth)
-                    matmul_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a, b,
-                                 pack_b ? packed_b((k - first_k) / depth) : nullptr, block, k, depth_at(k),
+                    matmul_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a,
+                                 packed_b((k - first_k) / depth), block, k, depth_at(k),
                                  k > 0 || store == Store::accumulate);
                 if (end_k == K) after(block);
             },

@@ -1034,6 +1034,7 @@ std::vector<Episode> rollout(Run& run, std::vector<Environment>& environments, A
     const Agent& agent = run.agent;
     const EnvironmentSpec& spec = agent.spec;
     const double reward_scale = agent.settings.reward_scale;
+    const KeepPacked weights(run.compute);
     std::vector<Episode> episodes(static_cast<size_t>(count));
     for (size_t i = 0; i < episodes.size(); ++i) {
         episodes[i].state.resize(static_cast<size_t>(spec.state_dim));

@@ -320,6 +320,7 @@ void bench_update(Measurements& measured, const Kernel& kernel, int threads, dou
             episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
         }
         const SequenceBatch batch = acting_batch(run.agent, playing);
+        const KeepPacked weights(run.compute);
         const Spread time = timed(9, [&] {
             run.acting.reset();
             forward(run.acting, run.agent.model, batch, Ask::last_state);
