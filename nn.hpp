@@ -430,7 +430,7 @@ ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float
 #pragma GCC unroll 4
         for (int v = 0; v < Vectors; ++v) {
             row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
-            __builtin_prefetch(b + 16 * tile_columns + v * lanes);
+            __builtin_prefetch(b + 16 * tile_columns + v * lanes);  // in acting, B comes from memory
         }
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r) {
