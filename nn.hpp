@@ -832,22 +832,16 @@ inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, V
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
     char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, kernel.depth()));
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
-    const size_t a_panel = kernel.panel_bytes(kernel.tile_rows, depth),
-                 b_panel = kernel.panel_bytes(kernel.tile_columns, depth);
-    const auto tiles = [&](auto&& f) {  // f(panel of A, first row, rows)
-        char* panel = packed_a;
-        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows, panel += a_panel)
-            f(panel, i, std::min(kernel.tile_rows, block.end_row - i));
-    };
     pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
                 block.end_row);
     kernel.prepare(true);
     for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns) {
-        const char* const panel_b = packed_b + static_cast<size_t>(j / kernel.tile_columns) * b_panel;
-        tiles([&](char* panel, int i, int rows) {
-            kernel.tile(&c(i, j), c.stride, panel, panel_b, depth, rows,
+        const char *panel_a = packed_a, *panel_b = packed_b + kernel.panel_bytes(j, depth);
+        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows) {
+            kernel.tile(&c(i, j), c.stride, panel_a, panel_b, depth, std::min(kernel.tile_rows, block.end_row - i),
                         std::min(kernel.tile_columns, block.end_column - j), add);
-        });
+            panel_a += kernel.panel_bytes(kernel.tile_rows, depth);
+        }
     }
     kernel.prepare(false);
 }
