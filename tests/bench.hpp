@@ -289,8 +289,46 @@ double update_flops(const Settings& settings) {
            (static_cast<double>(settings.layers - 1) * whole_layer + last_layer);
 }
 
+// What the machine has just shown that it can do: operations a second of products at the gym network's shapes, bytes a
+// second from memory.
+struct Rates {
+    double products, memory;
+};
+
+// The network's part of a step, at full windows. It needs the arithmetic of update_flops' forward pass, the last layer
+// asked for one token alone, and all weights once: its share is of the one that takes longer.
+void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates& rates) {
+    std::vector<Episode> playing(episodes);
+    for (Episode& episode : playing) {
+        episode.trajectory = run.replay.trajectories[0];
+        const size_t steps = static_cast<size_t>(episode.trajectory.length());
+        episode.returns_to_go.assign(steps + 1, 1.0f);
+        episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
+    }
+    const SequenceBatch batch = acting_batch(run.agent, playing);
+    const KeepPacked weights(run.compute);
+    const Spread time = timed(9, [&] {
+        run.acting.reset();
+        forward(run.acting, run.agent.model, batch, Ask::last_state);
+    });
+    const Kernel& kernel = run.compute.kernel;
+    const double d = static_cast<double>(run.agent.settings.width), tokens = 3.0 * batch.lengths[0] - 1,
+                 layers = static_cast<double>(run.agent.settings.layers);
+    const double operations = 2 * static_cast<double>(episodes) *
+                              ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d),
+                 bytes = 12 * layers * d * d * (kernel.parts > 0 ? 2 * kernel.parts : 4);
+    const double least = std::max(operations / rates.products, bytes / rates.memory);
+    measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]) +
+                      "; share of the products' own rate or the memory's speed",
+                  std::to_string(episodes) + " episodes, " + label(kernel),
+                  time,
+                  operations,
+                  bytes,
+                  {100 * least / time.high, 100 * least / time.median, 100 * least / time.low}});
+}
+
 template <class Environment>
-void bench_update(Measurements& measured, const Kernel& kernel, int threads, double products_rate, const char* what,
+void bench_update(Measurements& measured, const Kernel& kernel, int threads, const Rates& rates, const char* what,
                   const Settings& settings, const Environment& environment) {
     Compute compute(kernel, threads);
     Run run(compute, settings, environment.spec());
@@ -304,51 +342,31 @@ void bench_update(Measurements& measured, const Kernel& kernel, int threads, dou
                               for (int i = 0; i < repeats; ++i) update(run);
                           }) /
                           repeats);
-        shares.push_back(100 * operations / seconds.back() / products_rate);
+        shares.push_back(100 * operations / seconds.back() / rates.products);
     }
     measured.add({"updates; share of the products' own rate at the gym network's shapes",
                   std::string(what) + ", " + label(kernel) + ", " + std::to_string(threads) + " threads",
                   spread_of(seconds), operations, 0, spread_of(shares)});
     if (settings.context_length == 1) return;
-    // Acting: the network's part of a step, at full windows.
-    for (const size_t episodes : {size_t{1}, size_t{10}}) {
-        std::vector<Episode> playing(episodes);
-        for (Episode& episode : playing) {
-            episode.trajectory = run.replay.trajectories[0];
-            const size_t steps = static_cast<size_t>(episode.trajectory.length());
-            episode.returns_to_go.assign(steps + 1, 1.0f);
-            episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
-        }
-        const SequenceBatch batch = acting_batch(run.agent, playing);
-        const KeepPacked weights(run.compute);
-        const Spread time = timed(9, [&] {
-            run.acting.reset();
-            forward(run.acting, run.agent.model, batch, Ask::last_state);
-        });
-        const double d = static_cast<double>(settings.width), tokens = 3.0 * batch.lengths[0] - 1,
-                     layers = static_cast<double>(settings.layers);
-        measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]),
-                      std::to_string(episodes) + " episodes, " + label(kernel), time,
-                      2 * static_cast<double>(episodes) *
-                          ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d)});
-    }
+    for (const size_t episodes : {size_t{1}, size_t{10}}) bench_acting(measured, run, episodes, rates);
 }
 
-void bench_updates(Measurements& measured, const Kernel& kernel, int threads, double products_rate) {
+void bench_updates(Measurements& measured, const Kernel& kernel, int threads, const Rates& rates) {
     for (const char* preset : {"small", "paper"})
-        bench_update(measured, kernel, threads, products_rate,
+        bench_update(measured, kernel, threads, rates,
                      std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
                      default_settings("gridworld", "wodtem", preset), GridWorld{});
 #ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
     Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
     set_setting(gym, "behaviour", "random");
-    bench_update(measured, kernel, threads, products_rate, "halfcheetah, preset paper", gym,
+    bench_update(measured, kernel, threads, rates, "halfcheetah, preset paper", gym,
                  MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
 #endif
 }
 
-// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are.
-void bench_memory(Measurements& measured, size_t entries) {
+// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are. A look-up cannot do
+// without the nodes of one way down the tree: its share is of the `bandwidth` of one core, which no random access has.
+void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     constexpr size_t queries = 5000, arrivals = 1000, rounds = 15;
     MemoryConfig config{};
     config.state_dim = config.projected_dim = 4;
@@ -392,11 +410,21 @@ void bench_memory(Measurements& measured, size_t entries) {
         for (size_t i = 0; i < queries; ++i) memory.count_accesses(found[i]);
         ask += 4 * queries;
     });
-    const std::string group = "memory, " + std::to_string(entries) + " entries in 4 dimensions, K = 2, one core";
+    const std::string group =
+        "memory, " + std::to_string(entries) + " entries in 4 dimensions, K = 2, one core; share of the memory's speed";
     const auto add = [&](const char* what, Spread spread, double n) {
         measured.add({group, what, {spread.low / n, spread.median / n, spread.high / n}});
     };
-    add("look-up, 5000 at once", look_up, queries);
+    double way = 0;  // bytes: boxes, and what is in them
+    for (size_t level = 0; level < memory.tree.levels.size(); ++level)
+        way += static_cast<double>(sizeof(BoxTree::Lanes<float>) * (4 * BoxTree::sides(level) + 1));
+    const auto share = [&](double seconds) { return 100 * way * queries / seconds / bandwidth; };
+    measured.add({group,
+                  "look-up, 5000 at once",
+                  {look_up.low / queries, look_up.median / queries, look_up.high / queries},
+                  0,
+                  way,
+                  {share(look_up.high), share(look_up.median), share(look_up.low)}});
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);
     add("filling, an entry", {insertion, insertion, insertion}, static_cast<double>(entries));
@@ -422,18 +450,18 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
         measured.add(
             {"peaks", "10^9 operations in registers, " + label(*kernel) + ", 1 core", {second, second, second}, 1e9});
     }
-    bench_memory_bandwidth(measured, 1);
+    const double bandwidth_of_one = bench_memory_bandwidth(measured, 1);
     const double bandwidth = bench_memory_bandwidth(measured, threads);
     std::vector<double> rates;
     for (const Kernel* kernel : chosen) rates.push_back(bench_products(measured, *kernel, threads));
     bench_other_kernels(measured, *chosen[0], threads, bandwidth);
     for (size_t i = 0; i < chosen.size(); ++i)  // with vectors only the best ones: the others are slower in proportion
         if (chosen[i]->parts > 0 || i == 0 || chosen[i - 1]->parts > 0)
-            bench_updates(measured, *chosen[i], threads, rates[i]);
+            bench_updates(measured, *chosen[i], threads, {rates[i], bandwidth});
     rusage use{};
     getrusage(RUSAGE_SELF, &use);
     if (!json) std::printf("peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
-    for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(measured, entries);
+    for (const size_t entries : {size_t{200000}, size_t{2000000}}) bench_memory(measured, entries, bandwidth_of_one);
     if (json) measured.print_json();
 }
 
