@@ -762,7 +762,7 @@ inline const Kernel& choose_kernel(const std::string& name, const std::string& p
 // Products from tiles: packing and sharing out.
 
 // Scratch memory on cache lines (a vector load that straddles two costs two), grown to what was once asked for. What is
-// in it lasts until room() is called again.
+// in it lasts until more is asked for.
 struct Buffer {
     struct alignas(64) Line {
         char bytes[64];
@@ -787,7 +787,7 @@ struct Compute {
         Buffer packed;
         uint64_t period = 0;
     };
-    std::map<std::tuple<const float*, bool, int, int>, Kept> kept;  // lasting Bs, whole: data, transposed, K, N
+    std::map<std::tuple<const float*, int, bool, int, int>, Kept> kept;  // lasting Bs: data, stride, transposed, K, N
     uint64_t period = 0, periods = 0;  // of time in which a lasting B stays what it is; 0: not now
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
@@ -870,7 +870,8 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
     const int depth = kernel.depth();
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
-    Compute::Kept* const kept = b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.transposed, K, N}] : nullptr;
+    Compute::Kept* const kept =
+        b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.stride, b.transposed, K, N}] : nullptr;
     const int all_steps = divide_up(K, depth), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
               steps = kept ? all_steps : std::clamp(fitting, 1, all_steps);
     Buffer& buffer = kept ? kept->packed : compute.packed_b;

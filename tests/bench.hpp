@@ -30,7 +30,7 @@ Spread timed(int rounds, const std::function<void()>& work) {
     return spread_of(seconds);
 }
 
-// One measurement. The counts are what the task cannot do without; a share is of the peak of its own moment.
+// One measurement. The counts are what the task cannot do without; a share of a peak is of the peak of its own moment.
 struct Measurement {
     std::string group, name;
     Spread seconds;                    // of one
@@ -364,8 +364,9 @@ void bench_updates(Measurements& measured, const Kernel& kernel, int threads, co
 #endif
 }
 
-// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are. A look-up cannot do
-// without the nodes of one way down the tree: its share is of the `bandwidth` of one core, which no random access has.
+// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are. Of a look-up's
+// bytes, its leaf's are its own, while many share the nodes above: their share of one core's `bandwidth` says how far a
+// look-up, which waits for each node in turn, is from that.
 void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     constexpr size_t queries = 5000, arrivals = 1000, rounds = 15;
     MemoryConfig config{};
@@ -415,15 +416,13 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     const auto add = [&](const char* what, Spread spread, double n) {
         measured.add({group, what, {spread.low / n, spread.median / n, spread.high / n}});
     };
-    double way = 0;  // bytes: boxes, and what is in them
-    for (size_t level = 0; level < memory.tree.levels.size(); ++level)
-        way += static_cast<double>(sizeof(BoxTree::Lanes<float>) * (4 * BoxTree::sides(level) + 1));
-    const auto share = [&](double seconds) { return 100 * way * queries / seconds / bandwidth; };
+    constexpr double leaf = sizeof(BoxTree::Lanes<float>) * (4 + 1);  // its points, and their numbers
+    const auto share = [&](double seconds) { return 100 * leaf * queries / seconds / bandwidth; };
     measured.add({group,
                   "look-up, 5000 at once",
                   {look_up.low / queries, look_up.median / queries, look_up.high / queries},
                   0,
-                  way,
+                  leaf,
                   {share(look_up.high), share(look_up.median), share(look_up.low)}});
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);
@@ -442,7 +441,7 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
         if (kernel->supported() && (kernel_name == "auto" ? !imitation : kernel_name == kernel->name))
             chosen.push_back(kernel);
     }
-    if (!json) std::printf("medians (and ranges); a share is of the peak of its own moment\n");
+    if (!json) std::printf("medians (and ranges); a share of the peak is of the peak of its own moment\n");
     for (const Kernel* kernel : chosen) {
         double peak = 0;
         for (int round = 0; round < 20; ++round) peak = std::max(peak, burn_rate(*kernel));
