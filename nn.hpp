@@ -835,14 +835,11 @@ inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, V
     pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
                 block.end_row);
     kernel.prepare(true);
-    for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns) {
-        const char *panel_a = packed_a, *panel_b = packed_b + kernel.panel_bytes(j, depth);
-        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows) {
-            kernel.tile(&c(i, j), c.stride, panel_a, panel_b, depth, std::min(kernel.tile_rows, block.end_row - i),
+    for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns)
+        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows)
+            kernel.tile(&c(i, j), c.stride, packed_a + kernel.panel_bytes(i - block.first_row, depth),
+                        packed_b + kernel.panel_bytes(j, depth), depth, std::min(kernel.tile_rows, block.end_row - i),
                         std::min(kernel.tile_columns, block.end_column - j), add);
-            panel_a += kernel.panel_bytes(kernel.tile_rows, depth);
-        }
-    }
     kernel.prepare(false);
 }
 

@@ -22,6 +22,11 @@ Spread spread_of(std::vector<double> values) {
     return {values.front(), values[values.size() / 2], values.back()};
 }
 
+// Percent that the least seconds are of those measured.
+Spread share_of(double least, const Spread& seconds) {
+    return {100 * least / seconds.high, 100 * least / seconds.median, 100 * least / seconds.low};
+}
+
 // Seconds of `rounds` runs, after one that does not count.
 Spread timed(int rounds, const std::function<void()>& work) {
     work();
@@ -239,8 +244,7 @@ void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threa
     const std::string group = "other kernels, " + std::to_string(threads) + " threads; share of the memory's speed";
     const double row_bytes = 4.0 * tokens * d;
     const auto add = [&](const char* name, const Spread& time, double operations, double bytes) {
-        const auto share = [&](double seconds) { return 100 * bytes / seconds / bandwidth; };
-        measured.add({group, name, time, operations, bytes, {share(time.high), share(time.median), share(time.low)}});
+        measured.add({group, name, time, operations, bytes, share_of(bytes / bandwidth, time)});
     };
     Parameter<float> weight{"", {d}, std::vector<float>(d, 1.0f), std::vector<float>(d)}, bias = weight;
     std::vector<float> values(static_cast<size_t>(tokens) * d * 3, 0.5f), gradients(values.size());
@@ -295,8 +299,8 @@ struct Rates {
     double products, memory;
 };
 
-// The network's part of a step, at full windows. It needs the arithmetic of update_flops' forward pass, the last layer
-// asked for one token alone, and all weights once: its share is of the one that takes longer.
+// The network's part of a step, at full windows. It needs the operations of update_flops' forward pass, the last layer
+// asked for one token alone, and all weights once from memory; its share is of whichever of the two takes longer.
 void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates& rates) {
     std::vector<Episode> playing(episodes);
     for (Episode& episode : playing) {
@@ -317,14 +321,10 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
     const double operations = 2 * static_cast<double>(episodes) *
                               ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d),
                  bytes = 12 * layers * d * d * (kernel.parts > 0 ? 2 * kernel.parts : 4);
-    const double least = std::max(operations / rates.products, bytes / rates.memory);
     measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]) +
                       "; share of the products' own rate or the memory's speed",
-                  std::to_string(episodes) + " episodes, " + label(kernel),
-                  time,
-                  operations,
-                  bytes,
-                  {100 * least / time.high, 100 * least / time.median, 100 * least / time.low}});
+                  std::to_string(episodes) + " episodes, " + label(kernel), time, operations, bytes,
+                  share_of(std::max(operations / rates.products, bytes / rates.memory), time)});
 }
 
 template <class Environment>
@@ -364,9 +364,8 @@ void bench_updates(Measurements& measured, const Kernel& kernel, int threads, co
 #endif
 }
 
-// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are. Of a look-up's
-// bytes, its leaf's are its own, while many share the nodes above: their share of one core's `bandwidth` says how far a
-// look-up, which waits for each node in turn, is from that.
+// Points drawn uniformly from a cube; queries near stored points, as those of a replay buffer are. A look-up is counted
+// with the bytes of one leaf: the nodes above it are shared by many. `bandwidth`: one core's, bytes a second.
 void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     constexpr size_t queries = 5000, arrivals = 1000, rounds = 15;
     MemoryConfig config{};
@@ -413,17 +412,12 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     });
     const std::string group =
         "memory, " + std::to_string(entries) + " entries in 4 dimensions, K = 2, one core; share of the memory's speed";
-    const auto add = [&](const char* what, Spread spread, double n) {
-        measured.add({group, what, {spread.low / n, spread.median / n, spread.high / n}});
+    const auto add = [&](const char* what, Spread spread, double n, double bytes = 0) {
+        const Spread one = {spread.low / n, spread.median / n, spread.high / n};
+        measured.add({group, what, one, 0, bytes, share_of(bytes / bandwidth, one)});
     };
     constexpr double leaf = sizeof(BoxTree::Lanes<float>) * (4 + 1);  // its points, and their numbers
-    const auto share = [&](double seconds) { return 100 * leaf * queries / seconds / bandwidth; };
-    measured.add({group,
-                  "look-up, 5000 at once",
-                  {look_up.low / queries, look_up.median / queries, look_up.high / queries},
-                  0,
-                  leaf,
-                  {share(look_up.high), share(look_up.median), share(look_up.low)}});
+    add("look-up, 5000 at once", look_up, queries, leaf);
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);
     add("filling, an entry", {insertion, insertion, insertion}, static_cast<double>(entries));
