@@ -1,12 +1,14 @@
-// d4rl.hpp: data sets in D4RL's and Minari's layouts: where they are found, what they hold, and the trajectories in them.
+// d4rl.hpp: data sets in D4RL's and Minari's layouts: where they are found, their rows, and the trajectories in them.
 //
-// A D4RL file is one table of steps in the order in which they were taken (HDF5; N steps):
-//   observations (N, S), actions (N, A), rewards (N), terminals (N): the task ended the episode in this step,
-//   timeouts (N): the time limit did; next_observations (N, S) in the gym tasks alone; infos and metadata are not used.
-// Where an episode ends differs by family; cut_trajectories() has the rules. Minari: a group episode_0, episode_1, ...
-// for each, with one more observation than actions, and terminations and truncations.
-// Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN or
-// of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), training, writing.
+// A D4RL file is one table of N steps in the order in which they were taken (HDF5 data sets, numbers of any type):
+//   observations        N x S    the state s_t before the step      actions     N x A    a_t
+//   rewards             N        r_t                                terminals   N        the task ended the episode
+//   timeouts            N        the time limit ended the episode; missing in the first versions
+//   next_observations   N x S    s_{t+1}; in the gym tasks alone    infos, metadata      not used
+// A Minari file has a group for each episode, of T steps:
+//   episode_0/observations  T+1 x S | actions  T x A | rewards, terminations, truncations  T          episode_1/...
+// Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN
+// or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
 
 #include <cstdlib>
@@ -20,8 +22,9 @@
 #include "hdf5.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// What is published. Files and checksums: as TensorFlow Datasets records them; statistics: its catalogue, and comments of
-// public decision transformers; ant's mean returns from its normalised ones, 80.30 and 30.95. NaN and 0: not published.
+// The published data sets. Files and checksums are those that TensorFlow Datasets records; statistics are from its
+// catalogue and from comments in public decision transformers; ant's mean returns follow from its normalised ones,
+// 80.30 and 30.95. NaN and 0: not published.
 
 struct PublishedDataSet {
     const char* id;
@@ -75,24 +78,24 @@ inline const PublishedDataSet* find_published(std::string_view id) {
     return nullptr;
 }
 
-// The mean return of a gym task's medium set.
+// Returns the mean return of a gym task's medium set.
 inline double medium_return(const MujocoTask& task) {
     return find_published(std::string(task.name) + "-medium-v2")->mean_return;
 }
 
-// Its name without folders, as D4RL saves it.
+// Returns the file's name without folders, as D4RL saves it.
 inline std::string file_name(const PublishedDataSet& set) { return std::filesystem::path(set.file).filename(); }
 
 constexpr const char* own_folder = "runs/datasets";
 
-// D4RL's cache: where its environment variable says, else in the home folder.
+// Returns D4RL's cache: the folder that its environment variable names, else one in the home folder.
 inline std::string d4rl_folder() {
     if (const char* folder = std::getenv("D4RL_DATASET_DIR"); folder && *folder) return folder;
     const char* home = std::getenv("HOME");
     return std::string(home ? home : ".") + "/.d4rl/datasets";
 }
 
-// The file of a data set: D4RL's own, else ours. Errors: dataset.missing says where it looked and what to do.
+// Returns the path of a data set's file: in D4RL's folder, else in own_folder. Errors: dataset.missing.
 inline std::string find_data_set(const PublishedDataSet& set) {
     const std::string name = file_name(set);
     std::string looked;
@@ -108,7 +111,7 @@ inline std::string find_data_set(const PublishedDataSet& set) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The rows of a file.
+// The rows of a file
 
 struct Rows {
     size_t count = 0, state_dim = 0, action_dim = 0;
@@ -117,82 +120,111 @@ struct Rows {
     std::vector<uint8_t> terminals, timeouts;            // [count]; timeouts may be empty
 
     const float* observation(size_t row) const { return &observations[row * state_dim]; }
+    bool ends(size_t row) const { return terminals[row] != 0 || (!timeouts.empty() && timeouts[row] != 0); }
 };
 
-// A table [rows, columns]; a column may be (N) or (N, 1). Errors: dataset.shape, and those of hdf5.hpp.
-inline const Hdf5Dataset& table_of(const Hdf5File& file, const std::string& name, std::optional<uint64_t> rows,
-                                   std::optional<uint64_t> columns) {
+struct Hdf5Table {
+    const Hdf5Dataset& data;
+    uint64_t rows, columns;
+};
+
+// Returns a data set of two dimensions, or of one, which is a single column. Errors: dataset.shape if it is missing or
+// its rows or columns are not those expected.
+inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::optional<uint64_t> rows = {},
+                          std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
     if (!found)
         fail("dataset.shape", "%s: has no data set \"%s\"; it is not in D4RL's layout", file.path.c_str(),
              name.c_str());
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
-    if (shape.empty() || shape.size() > 2 || (rows && shape[0] != *rows) || (columns && width != *columns))
+    if (shape.empty() || shape.size() > 2 || shape[0] != rows.value_or(shape[0]) || width != columns.value_or(width))
         fail("dataset.shape", "%s: \"%s\" has shape %s, expected %s by %s", file.path.c_str(), name.c_str(),
              shape_text(shape).c_str(), rows ? std::to_string(*rows).c_str() : "any number",
              columns ? std::to_string(*columns).c_str() : "any number");
-    return *found;
+    return {*found, shape[0], width};
 }
 
-// Errors: dataset.shape, those of hdf5.hpp.
+// Reads D4RL's layout. Errors: dataset.shape, those of hdf5.hpp.
 inline Rows read_rows(const Hdf5File& file) {
+    const Hdf5Table states = table_of(file, "observations"), actions = table_of(file, "actions", states.rows);
     Rows rows;
-    const Shape shape = table_of(file, "observations", {}, {}).shape;
-    rows.count = shape[0];
-    rows.state_dim = shape.size() == 2 ? shape[1] : 1;
-    const Hdf5Dataset& actions = table_of(file, "actions", rows.count, {});
-    rows.action_dim = actions.shape.size() == 2 ? actions.shape[1] : 1;
+    rows.count = states.rows;
+    rows.state_dim = states.columns;
+    rows.action_dim = actions.columns;
     if (rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0)
         fail("dataset.shape", "%s: holds no steps", file.path.c_str());
-    rows.observations = file.read_floats(table_of(file, "observations", {}, {}));
-    rows.actions = file.read_floats(actions);
-    rows.rewards = file.read_floats(table_of(file, "rewards", rows.count, 1));
-    rows.terminals = file.read_flags(table_of(file, "terminals", rows.count, 1));
-    if (file.find("timeouts")) rows.timeouts = file.read_flags(table_of(file, "timeouts", rows.count, 1));
+    const auto column = [&](const char* name) -> const Hdf5Dataset& {
+        return table_of(file, name, rows.count, 1).data;
+    };
+    rows.observations = file.read_floats(states.data);
+    rows.actions = file.read_floats(actions.data);
+    rows.rewards = file.read_floats(column("rewards"));
+    rows.terminals = file.read_flags(column("terminals"));
+    if (file.find("timeouts")) rows.timeouts = file.read_flags(column("timeouts"));
     if (file.find("next_observations"))
-        rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim));
+        rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim).data);
     return rows;
 }
 
 inline bool is_minari(const Hdf5File& file) { return file.find("episode_0/observations") != nullptr; }
 
-// Minari's episodes as rows; the observation after the last action becomes the last row's next one.
+// Reads Minari's episodes, one after the other. The observation after the last action becomes the last row's next one.
+// Errors: dataset.shape, those of hdf5.hpp.
 inline Rows read_minari(const Hdf5File& file) {
     Rows rows;
     const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
     for (size_t episode = 0;; ++episode) {
         const std::string group = "episode_" + std::to_string(episode) + "/";
-        const Hdf5Dataset* found = file.find(group + "observations");
-        if (!found) break;
-        const Hdf5Dataset& actions = table_of(file, group + "actions", {}, {});
-        const uint64_t steps = actions.shape[0], A = actions.shape.size() == 2 ? actions.shape[1] : 1;
-        const Hdf5Dataset& states = table_of(file, group + "observations", steps + 1, {});
-        const uint64_t S = states.shape.size() == 2 ? states.shape[1] : 1;
-        if (episode == 0) rows.state_dim = S, rows.action_dim = A;
-        if (S != rows.state_dim || A != rows.action_dim || steps == 0)
-            fail("dataset.shape",
-                 "%s: %sobservations and actions have %zu and %zu columns, %zu steps; episode 0 has "
-                 "%zu and %zu columns",
-                 file.path.c_str(), group.c_str(), static_cast<size_t>(S), static_cast<size_t>(A),
-                 static_cast<size_t>(steps), rows.state_dim, rows.action_dim);
-        const std::vector<float> all = file.read_floats(states);
-        append(rows.observations, std::span(all).first(steps * S));
-        append(rows.next_observations, std::span(all).last(steps * S));
-        append(rows.actions, file.read_floats(actions));
-        append(rows.rewards, file.read_floats(table_of(file, group + "rewards", steps, 1)));
-        append(rows.terminals, file.read_flags(table_of(file, group + "terminations", steps, 1)));
-        append(rows.timeouts, file.read_flags(table_of(file, group + "truncations", steps, 1)));
+        if (!file.find(group + "observations")) return rows;
+        const Hdf5Table actions = table_of(file, group + "actions");
+        const uint64_t steps = actions.rows;
+        const Hdf5Table states = table_of(file, group + "observations", steps + 1);
+        if (episode == 0) rows.state_dim = states.columns;
+        if (episode == 0) rows.action_dim = actions.columns;
+        const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
+        if (states.columns != rows.state_dim || actions.columns != rows.action_dim || empty)
+            fail(
+                "dataset.shape",
+                "%s: %sobservations and actions have %zu and %zu columns, %zu steps; episode 0 has %zu and %zu columns",
+                file.path.c_str(), group.c_str(), size_t{states.columns}, size_t{actions.columns}, size_t{steps},
+                rows.state_dim, rows.action_dim);
+        const auto column = [&](const char* name) -> const Hdf5Dataset& {
+            return table_of(file, group + name, steps, 1).data;
+        };
+        const std::vector<float> all = file.read_floats(states.data);
+        append(rows.observations, std::span(all).first(steps * rows.state_dim));
+        append(rows.next_observations, std::span(all).last(steps * rows.state_dim));
+        append(rows.actions, file.read_floats(actions.data));
+        append(rows.rewards, file.read_floats(column("rewards")));
+        append(rows.terminals, file.read_flags(column("terminations")));
+        append(rows.timeouts, file.read_flags(column("truncations")));
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
-    return rows;
+}
+
+inline Rows read_data_set(const std::string& path) {
+    const Hdf5File file = open_hdf5(path);
+    return is_minari(file) ? read_minari(file) : read_rows(file);
+}
+
+// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 signature at 0, 512,
+// 1024, 2048, ...: an HDF5 user block may come before it.
+inline bool is_hdf5(const std::string& path) {
+    const std::filesystem::path extension = std::filesystem::path(path).extension();
+    if (extension == ".hdf5" || extension == ".h5") return true;
+    std::ifstream file(path, std::ios::binary);
+    char first[8];
+    for (std::streamoff at = 0; file.seekg(at).read(first, 8); at = at == 0 ? 512 : 2 * at)
+        if (std::string_view(first, 8) == "\211HDF\r\n\032\n") return true;
+    return false;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// From rows to trajectories.
+// From rows to trajectories
 
-// The rows `which`, in vectors without room to spare: a data set is large.
+// Returns the given rows as a trajectory, in vectors without room to spare: a data set is large.
 inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& which, bool terminated) {
     Trajectory trajectory;
     trajectory.states.reserve(which.size() * rows.state_dim);
@@ -208,60 +240,55 @@ inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& whi
     return trajectory;
 }
 
-// D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last one
-// allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: collection stopped there.
-// Where a file has no timeouts (the first versions), `limit` steps end one too. The gym sets of replay buffers also have
-// timeouts at the ends of collection blocks; they cut, as in D4RL. maze2d: terminals are all 0, and timeouts mark that a
-// navigation goal was reached; the body is not reset, and the next row starts where this one ended. So the trajectories
-// with the highest returns are those that leave the rewarded goal (see the README).
+// D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last
+// one allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: collection stopped there.
+//   No timeouts in the file (the first versions): `limit` steps end a trajectory too.
+//   Gym sets of replay buffers: timeouts also mark the ends of collection blocks; they cut, as in D4RL.
+//   maze2d: terminals are all 0, and timeouts mark that a navigation goal was reached; the body is not reset, and the
+//   next row starts where this one ended. So the highest returns belong to trajectories that leave the rewarded goal.
 inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
     std::vector<Trajectory> trajectories;
     std::vector<size_t> open;  // rows of the trajectory that has not ended yet
     for (size_t row = 0; row < rows.count; ++row) {
         open.push_back(row);
-        const bool terminal = rows.terminals[row] != 0,
-                   timeout = rows.timeouts.empty() ? open.size() == limit : rows.timeouts[row] != 0;
-        if (!terminal && !timeout) continue;
+        const bool full = rows.timeouts.empty() && open.size() == limit;
+        if (!rows.ends(row) && !full) continue;
+        trajectories.push_back(trajectory_of(rows, open, rows.terminals[row] != 0));
+        open.clear();
+    }
+    return trajectories;
+}
+
+// ODT's code for antmaze: it makes D4RL's Q-learning tuples (s_t, a_t, r_t, s_{t+1} = the next row), leaving out rows
+// with a timeout and the very last row. A trajectory ends at a terminal, where the next tuple does not start from
+// s_{t+1}, and with the last tuple. In umaze-v2 episodes go on after success, with a terminal in every row at the goal:
+// each becomes a trajectory of one step and return 1, as in ODT.
+inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
+    std::vector<size_t> tuples;
+    for (size_t row = 0; row + 1 < rows.count; ++row)
+        if (rows.timeouts.empty() || rows.timeouts[row] == 0) tuples.push_back(row);
+    const auto continues = [&](size_t row, size_t next) {
+        double squared = 0;
+        for (size_t i = 0; i < rows.state_dim; ++i) {
+            const double difference = static_cast<double>(rows.observation(next)[i]) - rows.observation(row + 1)[i];
+            squared += difference * difference;
+        }
+        return squared <= 1e-12;  // 1e-6 in norm
+    };
+    std::vector<Trajectory> trajectories;
+    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
+    for (size_t i = 0; i < tuples.size(); ++i) {
+        open.push_back(tuples[i]);
+        const bool terminal = rows.terminals[tuples[i]] != 0;
+        if (!terminal && i + 1 < tuples.size() && continues(tuples[i], tuples[i + 1])) continue;
         trajectories.push_back(trajectory_of(rows, open, terminal));
         open.clear();
     }
     return trajectories;
 }
 
-// ODT's code for antmaze: of D4RL's Q-learning tuples (s_t, a_t, r_t, s_{t+1} = the next row; rows with a timeout and the
-// very last row left out), a trajectory ends at a terminal, where the next tuple does not go on from s_{t+1}, and with
-// the last tuple. In umaze-v2 episodes go on after success, with a terminal in every row at the goal: each becomes a
-// trajectory of one step and return 1, as in ODT.
-inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
-    std::vector<Trajectory> trajectories;
-    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
-    const auto is_tuple = [&](size_t row) {
-        return row + 1 < rows.count && (rows.timeouts.empty() || rows.timeouts[row] == 0);
-    };
-    for (size_t row = 0; row + 1 < rows.count;) {
-        size_t next = row + 1;
-        if (!is_tuple(row)) {
-            row = next;
-            continue;
-        }
-        open.push_back(row);
-        while (next < rows.count && !is_tuple(next)) ++next;
-        double jump = 0;
-        for (size_t i = 0; next < rows.count && i < rows.state_dim; ++i) {
-            const double difference = static_cast<double>(rows.observation(next)[i]) - rows.observation(row + 1)[i];
-            jump += difference * difference;
-        }
-        const bool terminal = rows.terminals[row] != 0;
-        if (terminal || next >= rows.count || jump > 1e-12) {  // 1e-6 in norm
-            trajectories.push_back(trajectory_of(rows, open, terminal));
-            open.clear();
-        }
-        row = next;
-    }
-    return trajectories;
-}
-
-// Errors: dataset.task if the rows are not of this task's size, dataset.empty.
+// Returns a data set's trajectories by the rules of the task's family. Errors: dataset.task if the rows are not of this
+// task's size, dataset.empty.
 inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTask& task, const std::string& path) {
     if (rows.state_dim != static_cast<size_t>(task.state_dim) ||
         rows.action_dim != static_cast<size_t>(task.action_dim))
@@ -276,8 +303,8 @@ inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTa
     return trajectories;
 }
 
-// What a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding error.
-// Errors: dataset.not_finite, dataset.action with the row and the column.
+// Requires what a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding
+// error. Errors: dataset.not_finite, dataset.action with the row and the column.
 inline void require_sound(const Rows& rows, const std::string& path) {
     const auto require = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
         for (size_t i = 0; i < values.size(); ++i) {
@@ -295,32 +322,21 @@ inline void require_sound(const Rows& rows, const std::string& path) {
     require("rewards", rows.rewards, 1, any);
 }
 
-// By its name, so that a damaged file is told as such, or by its signature, which may stand behind a user's block.
-inline bool is_hdf5(const std::string& path) {
-    const std::filesystem::path extension = std::filesystem::path(path).extension();
-    if (extension == ".hdf5" || extension == ".h5") return true;
-    std::ifstream file(path, std::ios::binary);
-    char first[8];
-    for (std::streamoff at = 0; file.seekg(at).read(first, 8); at = at == 0 ? 512 : 2 * at)
-        if (std::string_view(first, 8) == "\211HDF\r\n\032\n") return true;
-    return false;
-}
-
-inline Rows read_data_set(const std::string& path) {
-    const Hdf5File file = open_hdf5(path);
-    return is_minari(file) ? read_minari(file) : read_rows(file);
-}
-
 // ---------------------------------------------------------------------------------------------------------------------
-// What a data set is like, for `wodtem info`.
+// Statistics of a data set, for `wodtem info`
 
 struct Moments {
     double count = 0, sum = 0, squares = 0, low = INFINITY, high = -INFINITY;
-    void add(double x) { ++count, sum += x, squares += x * x, low = std::min(low, x), high = std::max(high, x); }
+    void add(double x) {
+        ++count;
+        sum += x;
+        squares += x * x;
+        low = std::min(low, x);
+        high = std::max(high, x);
+    }
     double mean() const { return sum / count; }
-    double deviation() const {
-        return std::sqrt(std::max(0.0, squares / count - mean() * mean()));
-    }  // with 1/n, as D4RL's
+    // The divisor is n, as in D4RL's statistics.
+    double deviation() const { return std::sqrt(std::max(0.0, squares / count - mean() * mean())); }
     std::string text() const {
         char line[160];
         std::snprintf(line, sizeof line, "mean %.2f, deviation %.2f, %.2f to %.2f", mean(), deviation(), low, high);
@@ -340,17 +356,19 @@ struct DataSetStatistics {
     bool has_next = false;
 };
 
-// Rows that are there already, found by 64-bit hashes of their bytes.
+// Counts the rows that are equal to an earlier one, by 64-bit hashes of their bytes.
 inline size_t count_duplicates(const Rows& rows) {
     std::vector<uint64_t> hashes(rows.count);
-    std::vector<float> row;
+    std::string row;
+    const auto append = [&row](const float* values, size_t n) {
+        row.append(reinterpret_cast<const char*>(values), n * sizeof(float));
+    };
     for (size_t i = 0; i < rows.count; ++i) {
-        const float *state = rows.observation(i), *action = &rows.actions[i * rows.action_dim];
-        row.assign(state, state + rows.state_dim);
-        row.insert(row.end(), action, action + rows.action_dim);
-        row.push_back(rows.rewards[i]);
-        hashes[i] =
-            std::hash<std::string_view>{}({reinterpret_cast<const char*>(row.data()), row.size() * sizeof(float)});
+        row.clear();
+        append(rows.observation(i), rows.state_dim);
+        append(&rows.actions[i * rows.action_dim], rows.action_dim);
+        append(&rows.rewards[i], 1);
+        hashes[i] = std::hash<std::string>{}(row);
     }
     std::ranges::sort(hashes);
     return static_cast<size_t>(std::ranges::unique(hashes).size());
@@ -383,8 +401,8 @@ inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Traje
     for (size_t row = 0; row + 1 < rows.count; ++row) {
         const float *here = rows.observation(row), *next = rows.observation(row + 1);
         s.repeated += std::equal(here, here + width, next);
-        const bool ends = rows.terminals[row] != 0 || (!rows.timeouts.empty() && rows.timeouts[row] != 0);
-        s.jumps += s.has_next && !ends && !std::equal(next, next + width, &rows.next_observations[row * width]);
+        s.jumps +=
+            s.has_next && !rows.ends(row) && !std::equal(next, next + width, &rows.next_observations[row * width]);
     }
     return s;
 }

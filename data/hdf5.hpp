@@ -1,28 +1,13 @@
 // hdf5.hpp: reads the data sets that others published as HDF5 (D4RL's files, Minari's, whatever h5py writes), writes
 // plain ones that any h5py reads, and takes the SHA-256 of a file, by which a published file is recognised.
 //
-//   superblock ---> root group ----> link "actions" ----> object header of a data set
-//   (where the      object header    link "infos" --+       shape     (4, 3)
-//   root group is)  + a table        ...            |       type      float32, either byte order
-//                   of links                        |       filters   shuffle, deflate, fletcher32
-//                                                   |       layout ---> one run of bytes, or an index of chunks:
-//                                                   v
-//                                        group "infos": the same       +-------+-------+ every chunk has the same
-//                                        again, one level down         | chunk | chunk | extents (here 2 x 2), the
-//                                                                      +-------+--+----+ last ones hang over the
-//   A group is a symbol table (old files) or link messages,            | chunk | ch|unk  edge; each is filtered by
-//   in the header or in a heap (new files). Chunks are found           +-------+--+----+ itself; one that is missing
-//   through one of six indexes (Hdf5Parser below).                                       has the fill value
-//
 // SPEC below is the "HDF5 File Format Specification Version 3.0" (The HDF Group); no code of theirs was used.
 // Promises: what is read is what h5py reads; every checksum of what is read is verified; no input crashes or hangs the
 // reader or makes it allocate out of proportion; every error names the file, the object, the offset and what was
-// expected there. Leaves out: attributes, compound, variable-length and other types, filters but those three, soft and
-// external links, shared messages, virtual data sets (these data sets are listed, and refused when read), layout
-// messages before version 3 (HDF5 1.6.2 and older), rows in part. While a file is open nobody may shorten it (mmap).
+// expected there. Leaves out: attributes, compound, variable-length and other types, filters but shuffle, deflate and
+// fletcher32, soft and external links, shared messages, virtual data sets (these data sets are listed, and refused when
+// read), layout messages before version 3 (HDF5 1.6.2 and older), reading a part of the rows.
 #pragma once
-
-#include <sys/mman.h>
 
 #include <memory>
 #include <set>
@@ -31,45 +16,20 @@
 
 using Bytes = std::span<const uint8_t>;
 
-// A whole file as memory, without loading it.
-struct MappedFile {
-    Bytes bytes;
-
-    explicit MappedFile(const std::string& path) {
-        const FileDescriptor file(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));  // a pipe must not block us
-        if (file.fd < 0) fail_file("file.open", "open it", path);
-        const size_t size = regular_file_size(file, path);
-        if (size == 0) return;  // mmap refuses it
-        void* start = ::mmap(nullptr, size, PROT_READ, MAP_PRIVATE, file.fd, 0);
-        if (start == MAP_FAILED) fail_file("file.read", "map it into memory", path);
-        bytes = {static_cast<const uint8_t*>(start), size};
-    }
-    MappedFile(const MappedFile&) = delete;
-    MappedFile& operator=(const MappedFile&) = delete;
-    ~MappedFile() {
-        if (!bytes.empty()) ::munmap(const_cast<uint8_t*>(bytes.data()), bytes.size());
-    }
-};
-
 inline Bytes as_bytes(std::string_view text) { return {reinterpret_cast<const uint8_t*>(text.data()), text.size()}; }
 
-// Up to 8 bytes, least significant first.
+// Returns the first 8 bytes, or fewer, as a number, least significant first.
 inline uint64_t little_endian(Bytes bytes) {
     uint64_t value = 0;
-    if (!bytes.empty()) std::memcpy(&value, bytes.data(), bytes.size());
+    if (!bytes.empty()) std::memcpy(&value, bytes.data(), std::min<size_t>(bytes.size(), 8));
     return value;
-}
-
-// Then a terminal would not print it as it is.
-inline bool has_control(std::string_view name) {
-    return std::ranges::any_of(name, [](char c) { return (c >= 0 && c < 0x20) || c == 0x7F; });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Checksums
 
-// FIPS 180-4, sections 5.1.1 and 6.2. Hexadecimal digits.
-inline std::string sha256(Bytes message) {
+// Adds one block of 64 bytes to a SHA-256 (FIPS 180-4, section 6.2.2, with its letters).
+inline void sha256_block(std::array<uint32_t, 8>& hash, const uint8_t* block) {
     static constexpr uint32_t constants[64] = {
         0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
         0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
@@ -79,189 +39,190 @@ inline std::string sha256(Bytes message) {
         0xa2bfe8a1, 0xa81a664b, 0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070,
         0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
         0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
+    uint32_t w[64];
+    for (size_t t = 0; t < 16; ++t) {
+        std::memcpy(&w[t], block + 4 * t, 4);
+        w[t] = __builtin_bswap32(w[t]);
+    }
+    for (size_t t = 16; t < 64; ++t) {
+        const uint32_t x = w[t - 15], y = w[t - 2];
+        const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
+        w[t] = (std::rotr(y, 17) ^ std::rotr(y, 19) ^ y >> 10) + w[t - 7] + s0 + w[t - 16];
+    }
+    auto [a, b, c, d, e, f, g, h] = hash;
+    for (size_t t = 0; t < 64; ++t) {
+        const uint32_t s1 = std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25);
+        const uint32_t s0 = std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22);
+        const uint32_t t1 = h + s1 + ((e & f) ^ (~e & g)) + constants[t] + w[t];
+        const uint32_t t2 = s0 + ((a & b) ^ (a & c) ^ (b & c));
+        h = g;
+        g = f;
+        f = e;
+        e = d + t1;
+        d = c;
+        c = b;
+        b = a;
+        a = t1 + t2;
+    }
+    const uint32_t added[8] = {a, b, c, d, e, f, g, h};
+    for (size_t i = 0; i < 8; ++i) hash[i] += added[i];
+}
+
+// Returns the SHA-256 of a message as 64 hexadecimal digits.
+inline std::string sha256(Bytes message) {
     std::array<uint32_t, 8> hash = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
                                     0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
-    const auto block = [&hash](const uint8_t* bytes) {
-        uint32_t w[64];
-        for (size_t t = 0; t < 16; ++t) {
-            std::memcpy(&w[t], bytes + 4 * t, 4);
-            w[t] = __builtin_bswap32(w[t]);
-        }
-        for (size_t t = 16; t < 64; ++t) {
-            const uint32_t x = w[t - 15], y = w[t - 2];
-            const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
-            w[t] = (std::rotr(y, 17) ^ std::rotr(y, 19) ^ y >> 10) + w[t - 7] + s0 + w[t - 16];
-        }
-        auto [a, b, c, d, e, f, g, h] = hash;
-        for (size_t t = 0; t < 64; ++t) {
-            const uint32_t s1 = std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25);
-            const uint32_t s0 = std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22);
-            const uint32_t t1 = h + s1 + ((e & f) ^ (~e & g)) + constants[t] + w[t];
-            const uint32_t t2 = s0 + ((a & b) ^ (a & c) ^ (b & c));
-            h = g, g = f, f = e, e = d + t1, d = c, c = b, b = a, a = t1 + t2;
-        }
-        const uint32_t added[8] = {a, b, c, d, e, f, g, h};
-        for (size_t i = 0; i < 8; ++i) hash[i] += added[i];
-    };
     const size_t whole = message.size() / 64 * 64;
-    for (size_t at = 0; at < whole; at += 64) block(message.data() + at);
-    uint8_t tail[128] = {};  // the rest, a one bit, zeros, the length in bits
+    for (size_t at = 0; at < whole; at += 64) sha256_block(hash, message.data() + at);
+    uint8_t tail[128] = {};  // the rest, a one bit, zeros, the length in bits (section 5.1.1)
     const size_t rest = message.size() - whole, end = rest < 56 ? 64 : 128;
     if (rest > 0) std::memcpy(tail, message.data() + whole, rest);
     tail[rest] = 0x80;
     for (size_t i = 0; i < 8; ++i) tail[end - 1 - i] = static_cast<uint8_t>(message.size() * 8 >> (8 * i));
-    for (size_t at = 0; at < end; at += 64) block(tail + at);
+    for (size_t at = 0; at < end; at += 64) sha256_block(hash, tail + at);
     std::string digits;
     for (const uint32_t word : hash) digits += hex8(word);
     return digits;
 }
 
-inline std::string sha256_of_file(const std::string& path) { return sha256(MappedFile(path).bytes); }
+inline std::string sha256_of_file(const std::string& path) { return sha256(as_bytes(read_file(path))); }
 
-// Bob Jenkins's lookup3, hashlittle() with initial value 0: the checksum of all newer structures
+// Bob Jenkins's lookup3, hashlittle() with initial value 0: the checksum of the newer structures
 // (http://burtleburtle.net/bob/hash/doobs.html).
 inline uint32_t lookup3(Bytes key) {
-    uint32_t a = 0xDEADBEEF + static_cast<uint32_t>(key.size()), b = a, c = a;
-    const auto add = [&](size_t count) {  // up to 12 bytes; missing ones are zeros
-        uint32_t words[3] = {};
-        std::memcpy(words, key.data(), count);
-        a += words[0], b += words[1], c += words[2];
-        key = key.subspan(count);
+    constexpr int mix[] = {4, 6, 8, 16, 19, 4}, last[] = {14, 11, 25, 16, 4, 14, 24};
+    std::array<uint32_t, 3> s;
+    s.fill(0xDEADBEEF + static_cast<uint32_t>(key.size()));
+    const auto add = [&s](Bytes part) {  // up to 12 bytes; missing ones are zeros
+        for (size_t i = 0; i < part.size(); ++i) s[i / 4] += uint32_t{part[i]} << (8 * (i % 4));
     };
-    const auto step = [](uint32_t& x, uint32_t& y, uint32_t z, int bits) { x -= y, x ^= std::rotl(y, bits), y += z; };
-    while (key.size() > 12) {
-        add(12);
-        step(a, c, b, 4), step(b, a, c, 6), step(c, b, a, 8), step(a, c, b, 16), step(b, a, c, 19), step(c, b, a, 4);
+    for (; key.size() > 12; key = key.subspan(12)) {
+        add(key.first(12));
+        for (size_t i = 0; i < std::size(mix); ++i) {
+            uint32_t &x = s[i % 3], &y = s[(i + 2) % 3];
+            x = (x - y) ^ std::rotl(y, mix[i]);
+            y += s[(i + 1) % 3];
+        }
     }
-    if (key.empty()) return c;
-    add(key.size());
-    const auto last = [](uint32_t& x, uint32_t y, int bits) { x = (x ^ y) - std::rotl(y, bits); };
-    last(c, b, 14), last(a, c, 11), last(b, a, 25), last(c, b, 16), last(a, c, 4), last(b, a, 14), last(c, b, 24);
-    return c;
+    if (key.empty()) return s[2];
+    add(key);
+    for (size_t i = 0; i < std::size(last); ++i) {
+        uint32_t &x = s[(i + 2) % 3], y = s[(i + 1) % 3];
+        x = (x ^ y) - std::rotl(y, last[i]);
+    }
+    return s[2];
 }
 
-// Fletcher's checksum of big-endian 16-bit words as HDF5's filter 3 takes it. 65535 stands for 0 unless all are zero.
+// Fletcher's checksum of big-endian 16-bit words, as HDF5's filter 3 takes it: modulo 65535, where 65535 stands for 0
+// unless all words are zero.
 inline uint32_t fletcher32(Bytes bytes) {
     uint64_t sum1 = 0, sum2 = 0;
-    const auto fold = [](uint64_t& sum) {
+    const auto folded = [](uint64_t sum) {
         while (sum > 65535) sum = (sum & 65535) + (sum >> 16);
+        return sum;
     };
     for (size_t i = 0; i < bytes.size(); i += 2) {
         sum1 += static_cast<uint32_t>(bytes[i] << 8 | (i + 1 < bytes.size() ? bytes[i + 1] : 0));
         sum2 += sum1;
-        if ((i & 0xFFFE) == 0xFFFE) fold(sum1), fold(sum2);
+        if (i % 65536 != 65534) continue;  // the sums stay below 2^64
+        sum1 = folded(sum1);
+        sum2 = folded(sum2);
     }
-    fold(sum1), fold(sum2);
-    return static_cast<uint32_t>(sum2 << 16 | sum1);
+    return static_cast<uint32_t>(folded(sum2) << 16 | folded(sum1));
 }
 
-// RFC 1950, section 2.2 and 8.
+// RFC 1950, sections 2.2 and 8.
 inline uint32_t adler32(Bytes bytes) {
     uint32_t a = 1, b = 0;
     while (!bytes.empty()) {
         const Bytes part = bytes.first(std::min<size_t>(bytes.size(), 5552));  // b stays below 2^32
-        for (const uint8_t byte : part) a += byte, b += a;
-        a %= 65521, b %= 65521;
+        for (const uint8_t byte : part) {
+            a += byte;
+            b += a;
+        }
+        a %= 65521;
+        b %= 65521;
         bytes = bytes.subspan(part.size());
     }
     return b << 16 | a;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Inflate (RFC 1951 in the wrapper of RFC 1950). A code of up to `root` bits takes one look-up, a longer one two.
+// Inflate (RFC 1951, the sections named below), in the wrapper of RFC 1950. The lowest bit of a byte is read first.
+//
+//   stream   78 9C (or like it) | block | block ... | to the next byte | Adler-32 of the data, big-endian
+//   block    last block? 1 bit | type 2 bits | contents
+//              type 0: to the next byte | n u16 | ~n u16 | n bytes as they are               (3.2.4)
+//              type 1: symbols in two fixed codes                                            (3.2.6)
+//              type 2: the lengths of two codes, themselves coded | symbols in these codes   (3.2.7)
+//   symbol   0..255: a byte | 256: the end of the block | 257..285: a length of 3..258, extra bits, then, in the second
+//            code, a distance of 1..32768 (0..29), extra bits: that many bytes, from that far back, once more
 
-struct HuffmanTable {
-    // An entry: bits 0 to 4 the length of the code, 5 to 7 its kind, 8 to 15 `extra` bits that follow, 16 to 31 a value.
-    enum Kind : uint32_t { invalid = 0, literal = 1 << 5, number = 2 << 5, end_of_block = 3 << 5, longer = 4 << 5 };
-    static constexpr uint32_t root = 10;
-    std::array<uint32_t, (1 << root) + 288 * 32> entries;  // a second level of at most 2^(15 - root) for each symbol
+[[noreturn]] inline void bad_stream(const char* found) { throw Error("hdf5.deflate", found); }
 
-    // lengths[s]: bits of the code of symbol s, 0 if it has none; meaning[s]: its entry but for the length (section
-    // 3.2.2). A code must be complete, but for one of a single bit or none at all (section 3.2.7). False if not so.
-    bool build(std::span<const uint8_t> lengths, std::span<const uint32_t> meaning) {
+// A Huffman code. Section 3.2.2: the lengths determine it. Codes of one length are consecutive numbers in the order of
+// their symbols, and follow the shorter ones; the first bit read is a code's highest.
+struct HuffmanCode {
+    uint32_t mask = 0;                      // of the bits of the longest code
+    std::array<uint16_t, 1 << 15> entries;  // by the next bits: symbol << 4 | length of its code; 0: none begins so
+
+    // lengths[s]: bits of the code of symbol s, at most 15; 0: no code. Returns false unless the code is complete, but
+    // for one of a single bit or none at all (section 3.2.7).
+    bool build(std::span<const uint8_t> lengths) {
         std::array<uint32_t, 16> count{}, next{};
         for (const uint8_t length : lengths) ++count[length];
         count[0] = 0;
-        uint32_t code = 0, used = 0;  // `used` in units of 2^-15
+        uint32_t used = 0, longest = 0;  // `used`: share of all codes, in units of 2^-15
         for (uint32_t length = 1; length < 16; ++length) {
-            code = (code + count[length - 1]) << 1;
-            next[length] = code;
+            next[length] = (next[length - 1] + count[length - 1]) << 1;
             used += count[length] << (15 - length);
+            if (count[length] > 0) longest = length;
         }
         if (used != 0 && used != 1 << 15 && !(used == 1 << 14 && count[1] == 1)) return false;
-        std::fill_n(entries.begin(), 1 << root, invalid);
-        std::array<uint32_t, 288> codes;
-        std::array<uint8_t, 1 << root> deepest{};
-        for (size_t s = 0; s < lengths.size(); ++s) {  // codes come with their first bit lowest
-            const uint32_t length = lengths[s];
-            uint32_t forward = length == 0 ? 0 : next[length]++, reversed = 0;
-            for (uint32_t bit = 0; bit < length; ++bit, forward >>= 1) reversed = reversed << 1 | (forward & 1);
-            codes[s] = reversed;
-            uint8_t& deep = deepest[reversed & ((1 << root) - 1)];
-            if (length > root) deep = std::max(deep, lengths[s]);
-        }
-        uint32_t size = 1 << root;
+        mask = (1u << longest) - 1;
+        std::fill_n(entries.begin(), mask + 1, uint16_t{0});
         for (size_t s = 0; s < lengths.size(); ++s) {
-            const uint32_t length = lengths[s], first = codes[s] & ((1 << root) - 1);
+            const uint32_t length = lengths[s];
             if (length == 0) continue;
-            if (length <= root) {
-                for (uint32_t i = first; i < 1 << root; i += 1 << length) entries[i] = meaning[s] | length;
-                continue;
-            }
-            const uint32_t bits = deepest[first] - root;
-            if (entries[first] == invalid) {
-                entries[first] = size << 16 | bits << 8 | longer;
-                std::fill_n(entries.begin() + size, 1 << bits, invalid);
-                size += 1 << bits;
-            }
-            for (uint32_t i = codes[s] >> root; i < 1u << bits; i += 1u << (length - root))
-                entries[(entries[first] >> 16) + i] = meaning[s] | length;
+            const uint32_t code = next[length]++;
+            uint32_t reversed = 0;
+            for (uint32_t bit = 0; bit < length; ++bit) reversed |= (code >> bit & 1) << (length - 1 - bit);
+            for (uint32_t i = reversed; i <= mask; i += 1u << length)
+                entries[i] = static_cast<uint16_t>(s << 4 | length);
         }
         return true;
     }
 };
 
-// Section 3.2.5: symbols 257 to 285 are lengths 3 to 258; 0 to 29 distances 1 to 32768. 286, 287, 30 and 31 are invalid.
-inline constexpr auto length_meaning = [] {
-    using enum HuffmanTable::Kind;
-    std::array<uint32_t, 288> meaning{};
-    for (uint32_t s = 0; s < 256; ++s) meaning[s] = literal | s << 16;
-    meaning[256] = end_of_block;
-    for (uint32_t s = 257, base = 3; s < 285; ++s) {
-        const uint32_t extra = s < 261 ? 0 : (s - 261) / 4;
-        meaning[s] = number | extra << 8 | base << 16;
-        base += 1u << extra;
+// Section 3.2.5: a symbol stands for `least` plus a number of `extra` bits, which grow by one every `period` symbols.
+struct NumberRange {
+    uint32_t least, extra;
+};
+template <size_t n>
+constexpr std::array<NumberRange, n> number_ranges(uint32_t least, uint32_t period) {
+    std::array<NumberRange, n> ranges{};
+    for (uint32_t i = 0; i < n; ++i) {
+        ranges[i] = {least, i < period ? 0 : i / period - 1};
+        least += 1u << ranges[i].extra;
     }
-    meaning[285] = number | 258u << 16;
-    return meaning;
+    return ranges;
+}
+inline constexpr auto length_ranges = [] {
+    auto ranges = number_ranges<29>(3, 4);
+    ranges[28] = {258, 0};
+    return ranges;
 }();
-inline constexpr auto distance_meaning = [] {
-    std::array<uint32_t, 32> meaning{};
-    for (uint32_t s = 0, base = 1; s < 30; ++s) {
-        const uint32_t extra = s < 2 ? 0 : s / 2 - 1;
-        meaning[s] = HuffmanTable::number | extra << 8 | base << 16;
-        base += 1u << extra;
-    }
-    return meaning;
-}();
+inline constexpr auto distance_ranges = number_ranges<30>(1, 2);
 
-// Bits of a stream, lowest first.
 struct BitReader {
     const uint8_t *in, *in_end;
-    uint64_t bits = 0;
-    int count = 0;  // of valid bits; below 0: the input ended, and zeros were taken for it
+    uint64_t bits = 0;  // read, not yet taken
+    int count = 0;      // of them; below 0: the input ended, and zeros were taken for it
 
-    // At least 56 bits, as long as there is input.
+    // Makes at least 57 bits ready, as long as there is input.
     void refill() {
-        if (in_end - in >= 8) {
-            uint64_t word;
-            std::memcpy(&word, in, 8);
-            bits |= word << count;
-            in += (63 - count) >> 3;
-            count |= 56;
-        } else {
-            for (; count < 56 && in < in_end; count += 8) bits |= static_cast<uint64_t>(*in++) << count;
-        }
+        if (count < 0) bad_stream("the end of the compressed data");
+        for (; count <= 56 && in < in_end; count += 8) bits |= static_cast<uint64_t>(*in++) << count;
     }
     uint32_t take(uint32_t n) {  // n < 32
         const auto value = static_cast<uint32_t>(bits & ((uint64_t{1} << n) - 1));
@@ -269,187 +230,161 @@ struct BitReader {
         count -= static_cast<int>(n);
         return value;
     }
-    uint32_t decode(const HuffmanTable& table) {
-        uint32_t entry = table.entries[bits & ((1 << HuffmanTable::root) - 1)];
-        if ((entry & 0xE0) == HuffmanTable::longer)
-            entry = table.entries[(entry >> 16) + (bits >> HuffmanTable::root & ((1u << (entry >> 8 & 255)) - 1))];
-        take(entry & 31);
-        return entry;
+    uint32_t decode(const HuffmanCode& code) {
+        const uint32_t entry = code.entries[bits & code.mask];
+        if (entry == 0) bad_stream("a code that stands for nothing");
+        take(entry & 15);
+        return entry >> 4;
+    }
+    uint32_t number(std::span<const NumberRange> ranges, uint32_t symbol) {
+        if (symbol >= ranges.size()) bad_stream("a code that stands for nothing");
+        return ranges[symbol].least + take(ranges[symbol].extra);
     }
 };
 
-// Each part returns null or what is wrong.
+// Errors: hdf5.deflate with what was found.
 struct Inflater {
-    using enum HuffmanTable::Kind;
     BitReader source;
     uint8_t *out_start, *out, *out_end;
-    HuffmanTable lengths = {}, distances = {};
+    HuffmanCode symbols = {}, distances = {};
 
-    static constexpr const char *cut_off = "the end of the compressed data",
-                                *too_much = "more data than the chunk holds";
-
-    const char* stored() {  // section 3.2.4
+    void stored() {
         BitReader& s = source;
-        s.in -= s.count / 8, s.bits = 0, s.count = 0;
-        if (s.in_end - s.in < 4) return cut_off;
-        const size_t size = little_endian({s.in, 2}), inverse = little_endian({s.in + 2, 2});
-        s.in += 4;
-        if (size != (~inverse & 65535)) return "a stored block whose length does not match its complement";
-        if (static_cast<size_t>(s.in_end - s.in) < size) return cut_off;
-        if (static_cast<size_t>(out_end - out) < size) return too_much;
-        if (size > 0) std::memcpy(out, s.in, size);
-        s.in += size, out += size;
-        return nullptr;
+        s.in -= s.count / 8;  // whole bytes go back
+        s.bits = 0;
+        s.count = 0;
+        const auto left = static_cast<size_t>(s.in_end - s.in);
+        if (left < 4) bad_stream("the end of the compressed data");
+        const size_t size = little_endian({s.in, 2}), complement = little_endian({s.in + 2, 2});
+        if (size + complement != 65535) bad_stream("a stored block whose length does not match its complement");
+        if (left - 4 < size) bad_stream("the end of the compressed data");
+        if (static_cast<size_t>(out_end - out) < size) bad_stream("more data than the chunk holds");
+        out = std::copy_n(s.in + 4, size, out);
+        s.in += 4 + size;
     }
 
-    const char* read_codes() {  // section 3.2.7
+    void fixed_codes() {
+        std::array<uint8_t, 288> lengths;
+        for (size_t s = 0; s < 288; ++s) lengths[s] = s < 144 ? 8 : s < 256 ? 9 : s < 280 ? 7 : 8;
+        symbols.build(lengths);
+        lengths.fill(5);
+        distances.build(std::span(lengths).first(32));
+    }
+
+    void read_codes() {
         constexpr uint8_t order[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
-        std::array<uint8_t, 19> first{};
-        std::array<uint8_t, 286 + 30 + 137> found{};  // the last repetition may run over
         source.refill();
-        const size_t n_lengths = source.take(5) + 257, n_distances = source.take(5) + 1, n_order = source.take(4) + 4;
-        if (n_lengths > 286 || n_distances > 30) return "too many codes";
+        const size_t n_symbols = source.take(5) + 257, n_distances = source.take(5) + 1, n_order = source.take(4) + 4;
+        const size_t n = n_symbols + n_distances;
+        if (n_symbols > 286 || n_distances > 30) bad_stream("too many codes");
+        std::array<uint8_t, 19> first{};  // lengths of the code of lengths
         for (size_t i = 0; i < n_order; ++i) {
             source.refill();
             first[order[i]] = static_cast<uint8_t>(source.take(3));
         }
-        if (!lengths.build(first, length_meaning)) return "an invalid code of code lengths";
-        for (size_t at = 0; at < n_lengths + n_distances;) {
+        if (!symbols.build(first)) bad_stream("an invalid code of code lengths");
+        std::vector<uint8_t> lengths;
+        while (lengths.size() < n) {
             source.refill();
-            const uint32_t entry = source.decode(lengths), symbol = entry >> 16;
-            if ((entry & 0xE0) != literal || source.count < 0) return "an invalid code length";
-            if (symbol == 16 && at == 0) return "a repeated code length before the first";
-            const auto value = static_cast<uint8_t>(symbol < 16 ? symbol : symbol == 16 ? found[at - 1] : 0);
-            const uint32_t times = symbol < 16    ? 1
-                                   : symbol == 16 ? 3 + source.take(2)
-                                   : symbol == 17 ? 3 + source.take(3)
-                                                  : 11 + source.take(7);
-            for (uint32_t i = 0; i < times; ++i) found[at++] = value;
-            if (at > n_lengths + n_distances) return "more code lengths than codes";
+            const uint32_t symbol = source.decode(symbols);
+            if (symbol == 16 && lengths.empty()) bad_stream("a repeated code length before the first");
+            const auto value = static_cast<uint8_t>(symbol < 16 ? symbol : symbol == 16 ? lengths.back() : 0);
+            size_t times = 1;
+            if (symbol == 16) times = 3 + source.take(2);
+            if (symbol == 17) times = 3 + source.take(3);
+            if (symbol == 18) times = 11 + source.take(7);
+            lengths.insert(lengths.end(), times, value);
         }
-        if (found[256] == 0) return "no code for the end of the block";
-        return lengths.build(std::span(found).first(n_lengths), length_meaning) &&
-                       distances.build(std::span(found).subspan(n_lengths, n_distances), distance_meaning)
-                   ? nullptr
-                   : "an invalid set of code lengths";
+        if (lengths.size() > n) bad_stream("more code lengths than codes");
+        if (lengths[256] == 0) bad_stream("no code for the end of the block");
+        if (!symbols.build(std::span(lengths).first(n_symbols)) ||
+            !distances.build(std::span(lengths).last(n_distances)))
+            bad_stream("an invalid set of code lengths");
     }
 
-    const char* compressed() {
-        BitReader s = source;  // a copy: bytes that are written could be part of *this, for all the compiler knows
+    void compressed() {
+        BitReader s = source;  // local copies: for all the compiler knows, a byte written to `out` could be in *this
         uint8_t* to = out;
-        for (;;) {
-            s.refill();  // a length, a distance and the bits after each take 48 at most
-            uint32_t entry = s.decode(lengths);
-            if ((entry & 0xE0) == literal && to < out_end) {  // then there are 41 bits left, enough for one more
-                *to++ = static_cast<uint8_t>(entry >> 16);
-                entry = s.decode(lengths);
-                if ((entry & 0xE0) != literal) s.refill();
-            }
-            if (s.count < 0) return cut_off;
-            if ((entry & 0xE0) == literal) {
-                if (to == out_end) return too_much;
-                *to++ = static_cast<uint8_t>(entry >> 16);
+        while (true) {
+            s.refill();  // a length, a distance and the extra bits of both take 48 at most
+            const uint32_t symbol = s.decode(symbols);
+            if (symbol < 256) {
+                if (to == out_end) bad_stream("more data than the chunk holds");
+                *to++ = static_cast<uint8_t>(symbol);
                 continue;
             }
-            if ((entry & 0xE0) == end_of_block) break;
-            if ((entry & 0xE0) != number) return "a code that stands for nothing";
-            const size_t length = (entry >> 16) + s.take(entry >> 8 & 255);
-            const uint32_t far = s.decode(distances);
-            if ((far & 0xE0) != number) return "a code that stands for nothing";
-            const size_t distance = (far >> 16) + s.take(far >> 8 & 255);
-            if (s.count < 0) return cut_off;
-            if (distance > static_cast<size_t>(to - out_start)) return "a distance to before the start";
-            if (length > static_cast<size_t>(out_end - to)) return too_much;
+            if (symbol == 256) break;
+            const size_t length = s.number(length_ranges, symbol - 257);
+            const size_t distance = s.number(distance_ranges, s.decode(distances));
+            if (distance > static_cast<size_t>(to - out_start)) bad_stream("a distance to before the start");
+            if (length > static_cast<size_t>(out_end - to)) bad_stream("more data than the chunk holds");
             const uint8_t* from = to - distance;
-            uint8_t* const end = to + length;
-            if (distance >= 8 && out_end - end >= 8) {  // whole words, up to 7 bytes too many
-                for (; to < end; to += 8, from += 8) std::memcpy(to, from, 8);
-                to = end;
-            } else {
-                while (to < end) *to++ = *from++;
-            }
+            for (size_t i = 0; i < length; ++i) *to++ = *from++;  // may read what it wrote: a repeated pattern
         }
-        source = s, out = to;
-        return nullptr;
+        source = s;
+        out = to;
     }
 
-    const char* run() {  // section 3.2.3
-        for (bool last = false; !last;) {
+    void run() {
+        bool last = false;
+        while (!last) {
             source.refill();
             last = source.take(1) == 1;
             const uint32_t type = source.take(2);
-            if (source.count < 0) return cut_off;
-            if (type == 3) return "a block of type 3";
-            const char* wrong = nullptr;
-            if (type == 1) {  // section 3.2.6
-                std::array<uint8_t, 288> fixed;
-                for (size_t s = 0; s < 288; ++s) fixed[s] = s < 144 ? 8 : s < 256 ? 9 : s < 280 ? 7 : 8;
-                lengths.build(fixed, length_meaning);
-                fixed.fill(5);
-                distances.build(std::span(fixed).first(32), distance_meaning);
-            }
-            if (type == 2) wrong = read_codes();
-            if (wrong == nullptr) wrong = type == 0 ? stored() : compressed();
-            if (wrong != nullptr) return wrong;
+            if (type == 3) bad_stream("a block of type 3");
+            if (type == 1) fixed_codes();
+            if (type == 2) read_codes();
+            type == 0 ? stored() : compressed();
         }
+        if (source.count < 0) bad_stream("the end of the compressed data");
         source.in -= source.count / 8;
-        return nullptr;
     }
 };
 
-// Fills `out`, which must have the exact size of the data. Null, or what was found that should not be.
-inline const char* inflate_zlib(Bytes in, std::span<uint8_t> out) {
-    if (in.size() < 6 || (in[0] & 15) != 8 || in[0] >> 4 > 7 || (in[0] << 8 | in[1]) % 31 != 0 || (in[1] & 32) != 0)
-        return "no zlib header";
+// Fills `out`, which must have the exact size of the data. Errors: hdf5.deflate with what was found.
+inline void inflate_zlib(Bytes in, std::span<uint8_t> out) {
+    const bool header = in.size() >= 6 && (in[0] & 15) == 8 && in[0] >> 4 <= 7 && (in[0] << 8 | in[1]) % 31 == 0;
+    if (!header || (in[1] & 32) != 0) bad_stream("no zlib header");  // 32: with a dictionary
     const BitReader source{in.data() + 2, in.data() + in.size() - 4};
-    const auto state = std::make_unique<Inflater>(source, out.data(), out.data(), out.data() + out.size());  // 80 kB
-    if (const char* wrong = state->run()) return wrong;
-    if (state->out != state->out_end) return "less data than the chunk holds";
-    if (state->source.in != source.in_end) return "bytes after the end of the compressed data";
-    return __builtin_bswap32(static_cast<uint32_t>(little_endian(in.last(4)))) == adler32(out)
-               ? nullptr
-               : "data that does not match its Adler-32 checksum";
+    const auto state = std::make_unique<Inflater>(source, out.data(), out.data(), out.data() + out.size());  // 128 kB
+    state->run();
+    if (state->out != state->out_end) bad_stream("less data than the chunk holds");
+    if (state->source.in != source.in_end) bad_stream("bytes after the end of the compressed data");
+    if (__builtin_bswap32(static_cast<uint32_t>(little_endian(in.last(4)))) != adler32(out))
+        bad_stream("data that does not match its Adler-32 checksum");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // What a file holds
 
-// SPEC IV.A.2.d: how one element is stored.
+// How one element is stored (SPEC IV.A.2.d).
 struct Hdf5Element {
     enum Kind : uint8_t { other, floating, signed_integer, unsigned_integer, text } kind = other;
     bool big_endian = false;
-    uint8_t padding = 0;  // of text: 0 ends with a NUL (if there is room), 1 filled up with NULs, 2 with spaces
-    size_t size = 0;      // bytes
+    size_t size = 0;  // bytes; of numbers at most 8
 };
 
-// N elements to T (float, double; uint8_t: 0, 1, or 255 for any other value), `size` bytes each.
-template <class T, size_t size>
-void convert_elements(const Hdf5Element& element, const uint8_t* from, T* to, size_t n) {
-    const auto store = [](auto value) {
-        if constexpr (std::is_same_v<T, uint8_t>) return static_cast<uint8_t>(value == 0 ? 0 : value == 1 ? 1 : 255);
-        if constexpr (!std::is_same_v<T, uint8_t>) return static_cast<T>(value);
-    };
-    constexpr int unused = 64 - 8 * static_cast<int>(size);
-    for (size_t i = 0; i < n; ++i) {
-        uint64_t bits = 0;
-        std::memcpy(&bits, from + i * size, size);
-        if (element.big_endian) bits = __builtin_bswap64(bits) >> unused;
-        if (element.kind == Hdf5Element::floating)
-            to[i] = size == 4 ? store(std::bit_cast<float>(static_cast<uint32_t>(bits)))
-                              : store(std::bit_cast<double>(bits));
-        else if (element.kind == Hdf5Element::signed_integer)
-            to[i] = store(static_cast<int64_t>(bits << unused) >> unused);
-        else
-            to[i] = store(bits);
-    }
+// Returns the number stored at `from`, rounded to the nearest T.
+template <class T>
+T element_value(const Hdf5Element& element, const uint8_t* from) {
+    const int unused = 64 - 8 * static_cast<int>(element.size);
+    uint64_t bits = 0;
+    std::memcpy(&bits, from, element.size);
+    if (element.big_endian) bits = __builtin_bswap64(bits) >> unused;
+    if (element.kind == Hdf5Element::unsigned_integer) return static_cast<T>(bits);
+    if (element.kind == Hdf5Element::signed_integer)
+        return static_cast<T>(static_cast<int64_t>(bits << unused) >> unused);
+    if (element.size == 4) return static_cast<T>(std::bit_cast<float>(static_cast<uint32_t>(bits)));
+    return static_cast<T>(std::bit_cast<double>(bits));
 }
 
 template <class T>
-void convert_elements(const Hdf5Element& element, const uint8_t* from, T* to, size_t n) {
-    const auto choose = [&]<size_t... k>(std::index_sequence<k...>) {
-        (void)((element.size == k + 1 && (convert_elements<T, k + 1>(element, from, to, n), true)) || ...);
-    };
-    choose(std::make_index_sequence<8>());
+void convert_elements(const Hdf5Element& element, Bytes from, T* to) {
+    if (std::is_same_v<T, float> && element.kind == Hdf5Element::floating && element.size == 4 && !element.big_endian) {
+        if (!from.empty()) std::memcpy(to, from.data(), from.size());
+        return;
+    }
+    for (size_t at = 0; at < from.size(); at += element.size) *to++ = element_value<T>(element, &from[at]);
 }
 
 struct Hdf5Chunk {
@@ -460,6 +395,14 @@ struct Hdf5Chunk {
 
 enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
 
+// All chunks of a data set have the same extents. Here shape (4, 5), chunks of (2, 2), counts (2, 3); the last ones
+// hang over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
+//
+//   +-------+-------+---+---+
+//   | chunk | chunk | ch|unk|      place 0, 1, 2
+//   +-------+-------+---+---+
+//   | chunk | chunk | ch|unk|      place 3, 4, 5
+//   +-------+-------+---+---+
 struct Hdf5Dataset {
     std::string path;         // "infos/qpos": no slash at the start
     Shape shape;              // {}: a scalar
@@ -469,10 +412,11 @@ struct Hdf5Dataset {
 
     Hdf5Element element;
     Shape chunk;                           // extents of a chunk; of data in one run: the shape
+    Shape counts;                          // chunks in each dimension
     std::vector<Hdf5Filter> filters;       // in the order in which the writer applied them
     Bytes fill;                            // one element as stored; empty: zeros
     std::vector<Hdf5Chunk> chunks;         // those that exist
-    size_t elements = 1, chunk_bytes = 0;  // products that fit: checked when the file was opened
+    size_t elements = 1, chunk_bytes = 0;  // products that fit 64 bits: checked when the file is opened
 };
 
 struct Hdf5File {
@@ -481,136 +425,141 @@ struct Hdf5File {
     Bytes bytes;                        // the file from its superblock on; all addresses count from there
     std::vector<Hdf5Dataset> datasets;  // sorted by path, bytewise
 
-    // Null if there is none.
+    // Returns null if there is none.
     const Hdf5Dataset* find(std::string_view name) const {
         const auto found = std::ranges::lower_bound(datasets, name, {}, &Hdf5Dataset::path);
         return found != datasets.end() && found->path == name ? &*found : nullptr;
     }
 
-    // All elements, row-major. Numbers of any kind convert to the nearest float or double (float64 to float32 rounds to
-    // the nearest, and to infinity beyond the range; integers above 2^24 or 2^53 round).
+    // Returns all elements, row-major, each rounded to the nearest float (beyond the range: infinity).
+    // Errors: hdf5.unsupported, hdf5.type, hdf5.deflate, hdf5.checksum, hdf5.format.
     std::vector<float> read_floats(const Hdf5Dataset& dataset) const { return read<float>(dataset); }
-    std::vector<double> read_doubles(const Hdf5Dataset& dataset) const { return read<double>(dataset); }
 
-    // The same, for booleans stored as any kind of number: anything but 0 and 1 (NaN included) is an error.
+    // Returns booleans, stored as any kind of number. Errors: those of read_floats; hdf5.flag for anything but 0 and 1.
     std::vector<uint8_t> read_flags(const Hdf5Dataset& dataset) const {
-        std::vector<uint8_t> flags = read<uint8_t>(dataset);
-        const auto other = std::ranges::find(flags, 255);
-        if (other != flags.end())
+        const std::vector<double> values = read<double>(dataset);
+        const auto other = std::ranges::find_if(values, [](double value) { return value != 0 && value != 1; });
+        if (other != values.end())
             fail("hdf5.flag", "%s: element %zu is neither 0 nor 1, so this is no data set of flags",
-                 where(dataset).c_str(), static_cast<size_t>(other - flags.begin()));
-        return flags;
-    }
-
-    // One fixed-length string without its padding.
-    std::string read_text(const Hdf5Dataset& dataset) const {
-        check_readable(dataset, dataset.element.kind == Hdf5Element::text && dataset.elements == 1, "one text");
-        std::array<std::vector<uint8_t>, 2> buffers;
-        Bytes found = dataset.chunks.empty() ? dataset.fill : decode(dataset, dataset.chunks[0], buffers);
-        std::string text(found.begin(),
-                         found.begin() + static_cast<ptrdiff_t>(std::min(found.size(), dataset.element.size)));
-        if (dataset.element.padding == 0) text.resize(std::min(text.size(), text.find('\0')));
-        const char pad = dataset.element.padding == 2 ? ' ' : '\0';
-        while (!text.empty() && text.back() == pad) text.pop_back();
-        return text;
+                 where(dataset).c_str(), static_cast<size_t>(other - values.begin()));
+        return {values.begin(), values.end()};
     }
 
     std::string where(const Hdf5Dataset& dataset) const { return path + ": " + json_string(dataset.path); }
 
-    void check_readable(const Hdf5Dataset& dataset, bool suits, const char* wanted) const {
-        if (!dataset.unsupported.empty())
-            fail("hdf5.unsupported", "%s: cannot be read: %s", where(dataset).c_str(), dataset.unsupported.c_str());
-        if (!suits)
-            fail("hdf5.type", "%s: is %s of shape %s, expected %s", where(dataset).c_str(), dataset.type.c_str(),
-                 shape_text(dataset.shape).c_str(), wanted);
-    }
-
-    // The chunk_bytes bytes of a chunk, filters undone (SPEC IV.A.2.l); they lie in the file or in one of the buffers.
+    // Returns the chunk_bytes bytes of a chunk, its filters undone from the last to the first (SPEC IV.A.2.l). They lie
+    // in the file or in one of the buffers.
     Bytes decode(const Hdf5Dataset& dataset, const Hdf5Chunk& chunk,
                  std::array<std::vector<uint8_t>, 2>& buffers) const {
-        const auto damaged = [&](const char* id, const char* found) {
-            fail(id, "%s: chunk at offset %zu: found %s; the file is damaged, use another copy", where(dataset).c_str(),
-                 static_cast<size_t>(chunk.address), found);
-        };
+        const auto applied = [&](size_t i) { return (chunk.skipped >> i & 1) == 0; };
         Bytes data = bytes.subspan(chunk.address, chunk.size);
-        for (size_t i = dataset.filters.size(); i-- > 0;) {
-            if ((chunk.skipped >> i & 1) != 0) continue;
-            const Hdf5Filter filter = dataset.filters[i];
-            if (filter == Hdf5Filter::fletcher) {
-                if (data.size() < 4) damaged("hdf5.checksum", "no room for a checksum");
-                const Bytes stored = data.last(4);
-                data = data.first(data.size() - 4);
-                if (little_endian(stored) != fletcher32(data))
-                    damaged("hdf5.checksum", "data that do not match their Fletcher-32 checksum");
-                continue;
+        try {
+            for (size_t i = dataset.filters.size(); i-- > 0;) {
+                if (!applied(i)) continue;
+                std::vector<uint8_t>& out = buffers[data.data() == buffers[0].data()];  // not the one that is read
+                if (dataset.filters[i] == Hdf5Filter::fletcher) {
+                    data = without_checksum(data);
+                    continue;
+                }
+                if (dataset.filters[i] == Hdf5Filter::shuffle) {
+                    unshuffle(data, dataset.element.size, out);
+                } else {
+                    size_t size = dataset.chunk_bytes;
+                    for (size_t k = 0; k < i; ++k)
+                        if (dataset.filters[k] == Hdf5Filter::fletcher && applied(k)) size += 4;
+                    out.resize(size);
+                    inflate_zlib(data, out);
+                }
+                data = out;
             }
-            std::vector<uint8_t>& out = buffers[data.data() == buffers[0].data()];  // not the one that is read
-            if (filter == Hdf5Filter::deflate) {  // earlier filters may have added checksums
-                size_t size = dataset.chunk_bytes;
-                for (size_t k = 0; k < i; ++k)
-                    size += dataset.filters[k] == Hdf5Filter::fletcher && (chunk.skipped >> k & 1) == 0 ? 4 : 0;
-                out.resize(size);
-                if (const char* wrong = inflate_zlib(data, out)) damaged("hdf5.deflate", wrong);
-            } else {  // byte j of all elements, then byte j + 1 of all; a rest that is no whole element stays as it was
-                out.assign(data.begin(), data.end());
-                const size_t width = dataset.element.size, count = data.size() / width;
-                for (size_t j = 0; j < width; ++j)
-                    for (size_t k = 0; k < count; ++k) out[k * width + j] = data[j * count + k];
-            }
-            data = out;
+            if (data.size() != dataset.chunk_bytes)
+                throw Error("hdf5.format", "a chunk of another size than the others");
+        } catch (const Error& error) {
+            fail(error.id.c_str(), "%s: chunk at offset %zu: found %s; the file is damaged, use another copy",
+                 where(dataset).c_str(), static_cast<size_t>(chunk.address), error.what());
         }
-        if (data.size() != dataset.chunk_bytes) damaged("hdf5.format", "a chunk of another size than the others");
         return data;
     }
 
+    static Bytes without_checksum(Bytes data) {
+        if (data.size() < 4) throw Error("hdf5.checksum", "no room for a checksum");
+        const Bytes covered = data.first(data.size() - 4);
+        if (little_endian(data.last(4)) != fletcher32(covered))
+            throw Error("hdf5.checksum", "data that do not match their Fletcher-32 checksum");
+        return covered;
+    }
+
+    // Shuffled data are byte 0 of all elements, then byte 1 of all, ...; a rest below one element stays in place.
+    static void unshuffle(Bytes data, size_t width, std::vector<uint8_t>& out) {
+        out.assign(data.begin(), data.end());
+        const size_t count = data.size() / width;
+        for (size_t j = 0; j < width; ++j)
+            for (size_t k = 0; k < count; ++k) out[k * width + j] = data[j * count + k];
+    }
+
+    // Errors: as read_floats.
     template <class T>
     std::vector<T> read(const Hdf5Dataset& dataset) const {
         const Hdf5Element& element = dataset.element;
-        check_readable(dataset, element.kind != Hdf5Element::text, "numbers");
-        T filled{};
-        if (!dataset.fill.empty()) convert_elements(element, dataset.fill.data(), &filled, 1);
-        std::vector<T> out(dataset.elements, filled);
-        const size_t rank = dataset.shape.size();
-        std::vector<size_t> grid(rank), start(rank), extent(rank), at(rank);
-        for (size_t k = 0; k < rank && dataset.elements > 0; ++k)
-            grid[k] = (dataset.shape[k] - 1) / dataset.chunk[k] + 1;
+        if (!dataset.unsupported.empty())
+            fail("hdf5.unsupported", "%s: cannot be read: %s", where(dataset).c_str(), dataset.unsupported.c_str());
+        if (element.kind == Hdf5Element::text)
+            fail("hdf5.type", "%s: is %s, expected numbers", where(dataset).c_str(), dataset.type.c_str());
+        std::vector<T> out(dataset.elements,
+                           dataset.fill.empty() ? T{} : element_value<T>(element, dataset.fill.data()));
         std::array<std::vector<uint8_t>, 2> buffers;
+        std::vector<T> values;
         for (const Hdf5Chunk& chunk : dataset.chunks) {
             const Bytes data = decode(dataset, chunk, buffers);
-            for (size_t k = rank, rest = chunk.place; k-- > 0; rest /= grid[k]) {
-                start[k] = rest % grid[k] * dataset.chunk[k];
-                extent[k] = std::min(dataset.chunk[k], dataset.shape[k] - start[k]);
+            if (dataset.chunk == dataset.shape) {
+                convert_elements(element, data, out.data());
+                continue;
             }
-            // The last dimensions, as long as they have no gaps on either side, make one run; the others are counted.
-            size_t outer = rank, run = 1;
-            for (bool whole = true; outer > 0 && whole;) {
-                --outer;
-                run *= extent[outer];
-                whole = extent[outer] == dataset.chunk[outer] && extent[outer] == dataset.shape[outer];
-            }
-            std::ranges::fill(at, 0);
-            for (bool more = true; more;) {
-                size_t from = 0, to = 0;
-                for (size_t k = 0; k < rank; ++k) {
-                    from = from * dataset.chunk[k] + at[k];
-                    to = to * dataset.shape[k] + start[k] + at[k];
-                }
-                convert_elements(element, data.data() + from * element.size, out.data() + to, run);
-                more = false;
-                for (size_t k = outer; k-- > 0 && !more;) {
-                    more = ++at[k] < extent[k];
-                    if (!more) at[k] = 0;
-                }
-            }
+            values.resize(data.size() / element.size);
+            convert_elements(element, data, values.data());
+            Shape start(dataset.shape.size());  // of the chunk's first element in the data set
+            uint64_t rest = chunk.place;
+            for (size_t k = start.size(); k-- > 0; rest /= dataset.counts[k])
+                start[k] = rest % dataset.counts[k] * dataset.chunk[k];
+            copy_chunk(dataset, start, 0, 0, 0, values, out);
         }
         return out;
+    }
+
+    // Copies the part of a chunk that lies within the data set, one dimension k after the other. `from` and `to` number
+    // the rows of the dimensions before k, row-major, in the chunk and in the data set.
+    template <class T>
+    static void copy_chunk(const Hdf5Dataset& dataset, const Shape& start, size_t k, size_t from, size_t to,
+                           const std::vector<T>& values, std::vector<T>& out) {
+        const size_t extent = std::min(dataset.chunk[k], dataset.shape[k] - start[k]);
+        from = from * dataset.chunk[k];
+        to = to * dataset.shape[k] + start[k];
+        if (k + 1 == start.size()) {
+            std::copy_n(&values[from], extent, &out[to]);
+            return;
+        }
+        for (size_t i = 0; i < extent; ++i) copy_chunk(dataset, start, k + 1, from + i, to + i, values, out);
     }
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Reading the structures
+//
+//   superblock ---> root group ----> link "actions" ----> object header of a data set
+//   (where the      object header    link "infos" --+       dataspace  (4, 5)
+//   root group is)  + links          ...            |       datatype   float32, either byte order
+//                                                   |       filters    shuffle, deflate, fletcher32
+//                        group "infos": the same <--+       fill value
+//                        again, one level down              layout --> one run of bytes, or an index of chunks
+//
+//   links of a group   a symbol table: B-tree 1 of symbol nodes, names in a local heap          (old files)
+//                      link messages in the header, or in a fractal heap found by a B-tree 2    (new files)
+//   index of chunks    layout 3: B-tree 1. Layout 4: single chunk, implicit (chunk after chunk), fixed array,
+//                      extensible array (one dimension unlimited), B-tree 2 (several unlimited)
+//   All numbers are little-endian, addresses and lengths u64; the undefined address is 2^64 - 1 (SPEC V). Newer
+//   structures begin with four letters and a version and end with the lookup3 checksum of all before it.
 
-inline constexpr uint64_t undefined_address = ~uint64_t{0};  // SPEC V
+inline constexpr uint64_t undefined_address = ~uint64_t{0};
 
 // Links in a circle, or one structure used again and again, end when more has been read than `budget`, a few times the
 // size of the file; this also bounds what is allocated. Depths are bounded where they occur.
@@ -620,32 +569,34 @@ struct Hdf5Parser {
     std::string object = "superblock";  // being read, for messages
     std::set<uint64_t> groups = {};     // addresses already visited
 
-    [[noreturn]] void damaged(const char* id, uint64_t offset, const std::string& expected) const {
+    [[noreturn]] void damaged(const char* id, uint64_t offset, std::string_view expected) const {
         fail(id, "%s: %s: offset %zu: expected %s; the file is damaged or of a kind unknown to this reader",
-             file.path.c_str(), object.c_str(), static_cast<size_t>(offset), expected.c_str());
+             file.path.c_str(), object.c_str(), static_cast<size_t>(offset), std::string(expected).c_str());
     }
-    // The one place that touches the file's structures.
-    Bytes bytes(uint64_t offset, uint64_t n) {
+    void require_inside(uint64_t offset, uint64_t n) const {
         if (offset > file.bytes.size() || n > file.bytes.size() - offset)
             damaged("hdf5.truncated", offset,
                     std::to_string(n) + " bytes (the file ends at " + std::to_string(file.bytes.size()) + ")");
-        charge(offset, n);
-        return file.bytes.subspan(offset, n);
     }
     void charge(uint64_t offset, uint64_t n) {
         if (n > budget) damaged("hdf5.cycle", offset, "an end: structures refer to each other in a circle");
         budget -= n;
+    }
+    // Returns a part of the file; structures are read through here alone.
+    Bytes bytes(uint64_t offset, uint64_t n) {
+        require_inside(offset, n);
+        charge(offset, n);
+        return file.bytes.subspan(offset, n);
     }
     uint64_t product(uint64_t a, uint64_t b, uint64_t offset) const {
         uint64_t result;
         if (__builtin_mul_overflow(a, b, &result)) damaged("hdf5.too_large", offset, "a size of at most 64 bits");
         return result;
     }
-
-    static constexpr uint64_t no_limit = ~uint64_t{0};  // to an extent: SPEC IV.A.2.b
+    static uint64_t quotient(uint64_t a, uint64_t b) { return a / b + (a % b != 0 ? 1 : 0); }  // rounded up
     static uint64_t log2(uint64_t value) { return static_cast<uint64_t>(std::bit_width(value)) - 1; }
 
-    // Reads one thing after the other.
+    // Reads one field after the other from [at, end).
     struct Cursor {
         Hdf5Parser& parser;
         uint64_t at, end;
@@ -658,31 +609,49 @@ struct Hdf5Parser {
             return parser.bytes(at - n, n);
         }
         uint64_t number(uint64_t size) { return little_endian(take(size)); }
-        void expect(bool holds, const std::string& what, const char* id = "hdf5.format") const {
+        // Returns the next fields, given their sizes in bytes; one of more than 8 bytes is not needed here.
+        template <class... Sizes>
+        std::array<uint64_t, sizeof...(Sizes)> fields(Sizes... sizes) {
+            return {number(static_cast<uint64_t>(sizes))...};  // braces: from the first to the last
+        }
+        void expect(bool holds, std::string_view what, const char* id = "hdf5.format") const {
             if (!holds) parser.damaged(id, start, what);
         }
-        // A signature and a version.
-        void begins(std::string_view signature, uint64_t version) {
-            const Bytes found = take(signature.size());
-            expect(std::ranges::equal(found, as_bytes(signature)), "the signature " + std::string(signature));
-            expect(number(1) == version, "version " + std::to_string(version) + " after " + std::string(signature));
+        void signature(std::string_view letters) {
+            const Bytes found = take(letters.size());
+            expect(std::ranges::equal(found, as_bytes(letters)), "the signature " + std::string(letters));
         }
-        // Bytes `start` to here, then their checksum.
+        void begins(std::string_view letters, uint64_t version) {
+            signature(letters);
+            expect(number(1) == version, "the byte " + std::to_string(version) + " after " + std::string(letters));
+        }
+        // Bytes `start` to here are covered by the checksum that follows.
         void checksum() {
             const Bytes covered = parser.file.bytes.subspan(start, at - start);
             expect(number(4) == lookup3(covered), "data that match their checksum", "hdf5.checksum");
         }
+        // Returns the next n bytes, the last before the checksum, which is verified.
+        Cursor checked(uint64_t n) {
+            Cursor next = *this;
+            take(n);
+            next.end = at;
+            checksum();
+            return next;
+        }
     };
     Cursor cursor(uint64_t address) {
-        bytes(address, 0);
+        require_inside(address, 0);
         return {*this, address, file.bytes.size()};
     }
     Cursor cursor(uint64_t address, uint64_t size) {
-        bytes(address, 0), bytes(address, size), budget += size;  // charged when it is taken
+        require_inside(address, size);
         return {*this, address, address + size};
     }
 
-    // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...: others may keep what they like before it.
+    // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...; a user block may come before it.
+    //   version 0, 1   signature 8 | version | 4 versions | 8, 8: widths | .. | base 8 | free space 8 | end of file 8 |
+    //                  driver 8 | root group: name 8, object header 8
+    //   version 2, 3   signature 8 | version | 8, 8 | flags | base 8 | extension 8 | end of file 8 | root 8 | sum
     void superblock() {
         constexpr std::string_view signature = "\x89HDF\r\n\x1a\n";
         const Bytes all = file.bytes;
@@ -692,19 +661,19 @@ struct Hdf5Parser {
         if (base + 8 > all.size())
             fail("hdf5.format", "%s: is not an HDF5 file (it has no superblock)", file.path.c_str());
         file.bytes = all.subspan(base);
-        Cursor c = cursor(0);
-        c.take(8);
+        Cursor c = cursor(8);
+        c.start = 0;
         const uint64_t version = c.number(1);
         c.expect(version <= 3, "a superblock of version 0 to 3");
         if (version < 2) c.take(4);
         c.expect(c.number(1) == 8 && c.number(1) == 8, "offsets and lengths of 8 bytes", "hdf5.unsupported");
         c.take(version == 0 ? 9 : version == 1 ? 13 : 1);
-        c.take(16);  // base address; free space or superblock extension
+        c.take(16);
         const uint64_t end = c.number(8);
         if (end > all.size())
             fail("hdf5.truncated", "%s: has %zu bytes, its superblock says %zu; the file was cut off",
                  file.path.c_str(), all.size(), static_cast<size_t>(end));
-        if (version < 2) c.take(16);  // driver information; the root group's name
+        if (version < 2) c.take(16);
         const uint64_t root = c.number(8);
         if (version >= 2) c.checksum();
         link("", root, 0);
@@ -712,6 +681,9 @@ struct Hdf5Parser {
     }
 
     // --- Object headers, SPEC IV.A.1
+    //   version 1   1 | .. | count 2 | references 4 | size 4 | .. 4 | messages: type 2, size 2, flags 1, .. 3, data
+    //   version 2   OHDR 2 | flags | .. | size 1..8 | messages: type 1, size 2, flags 1, [order 2], data | sum
+    // A message of type 0x10 says where more of them are (IV.A.2.q): address 8, length 8.
 
     struct Message {
         uint64_t type, flags;
@@ -721,53 +693,43 @@ struct Hdf5Parser {
     std::vector<Message> messages(uint64_t address) {
         std::vector<Message> out;
         std::vector<Cursor> blocks;
-        const bool old = bytes(address, 1)[0] == 1;
-        uint64_t prefix = 8, extra = 0;  // before the data of a message
+        uint64_t type_size = 2, rest = 3;  // bytes of the type, and between flags and data
         Cursor c = cursor(address);
-        if (old) {  // IV.A.1.a
-            c.take(8);
-            const uint64_t size = c.number(4);
-            c.take(4);
+        const bool old = bytes(address, 1)[0] == 1;
+        if (old) {
+            const auto [counts, size, reserved] = c.fields(8, 4, 4);
             blocks.push_back(cursor(c.at, size));
-        } else {  // IV.A.1.b
+        } else {
             c.begins("OHDR", 2);
             const uint64_t flags = c.number(1);
             c.take(((flags & 32) != 0 ? 16 : 0) + ((flags & 16) != 0 ? 4 : 0));
-            const uint64_t size = c.number(uint64_t{1} << (flags & 3));
-            extra = (flags & 4) != 0 ? 2 : 0;
-            prefix = 4 + extra;
-            blocks.push_back(cursor(c.at, size));
-            c.take(size);
-            c.checksum();
+            type_size = 1;
+            rest = (flags & 4) != 0 ? 2 : 0;
+            blocks.push_back(c.checked(c.number(uint64_t{1} << (flags & 3))));
         }
         for (size_t b = 0; b < blocks.size(); ++b) {
             Cursor block = blocks[b];
-            while (block.end - block.at >= prefix) {
-                const uint64_t type = block.number(old ? 2 : 1), size = block.number(2), flags = block.number(1);
-                block.take(old ? 3 : extra);
-                const Cursor data = cursor(block.at, size);
+            while (block.end - block.at >= type_size + 3 + rest) {
+                const auto [type, size, flags, unused] = block.fields(type_size, 2, 1, rest);
+                Cursor data = cursor(block.at, size);
                 block.expect(size <= block.end - block.at, "a message within its block");
                 block.at += size;
-                if (type != 0x10) {
-                    if (type != 0) out.push_back({type, flags, data});
-                    continue;
-                }
-                Cursor next = data;  // a continuation block, IV.A.2.q
-                const uint64_t where = next.number(8), length = next.number(8);
-                Cursor more = cursor(where, length);
-                if (!old) {
-                    block.expect(length >= 8, "a continuation block of at least 8 bytes");
-                    more.end -= 4;
-                    more.expect(std::ranges::equal(more.take(4), as_bytes("OCHK")), "the signature OCHK");
-                    Cursor check = more;
-                    check.end += 4;
-                    check.take(length - 8);
-                    check.checksum();
-                }
-                blocks.push_back(more);
+                if (type == 0x10)
+                    blocks.push_back(continuation(data, old));
+                else if (type != 0)
+                    out.push_back({type, flags, data});
             }
         }
         return out;
+    }
+
+    Cursor continuation(Cursor message, bool old) {
+        const auto [address, length] = message.fields(8, 8);
+        Cursor block = cursor(address, length);
+        if (old) return block;
+        block.expect(length >= 8, "a continuation block of at least 8 bytes");
+        block.signature("OCHK");
+        return block.checked(length - 8);
     }
 
     // --- Groups
@@ -777,7 +739,7 @@ struct Hdf5Parser {
         uint64_t address;
     };
 
-    // What a link leads to. A link to a named type is passed over.
+    // Reads the data set or group that a link leads to. A link to a named type is passed over.
     void link(const std::string& path, uint64_t address, int depth) {
         object = path.empty() ? "root group" : json_string(path);
         if (depth > 32 || path.size() > 4096) damaged("hdf5.cycle", address, "at most 32 groups in each other");
@@ -799,19 +761,17 @@ struct Hdf5Parser {
         }
     }
 
-    // SPEC III.A.1: a version-1 B-tree. Calls leaf(key, child) in order; the key's end is the reader's business.
+    // SPEC III.A.1: a version-1 B-tree. Calls leaf(key, child) in order; only `leaf` knows what a key means.
+    //   TREE | type | level | entries 2 | siblings 8, 8 | key 0 | child 0: address 8 | key 1 | child 1 | ...
+    static constexpr uint64_t any_level = 256;
     template <class F>
-    void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const F& leaf, int level = -1) {
+    void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const F& leaf, uint64_t level = any_level) {
         Cursor c = cursor(address);
-        const Bytes found = c.take(5);
-        c.expect(std::ranges::equal(found.first(4), as_bytes("TREE")) && found[4] == type,
-                 "a node of a B-tree of type " + std::to_string(type));
-        const int depth = static_cast<int>(c.number(1));
-        c.expect(level < 0 || depth == level, "a node of level " + std::to_string(level));
-        const uint64_t entries = c.number(2);
-        c.take(16);  // siblings
+        c.begins("TREE", type);
+        const auto [depth, entries, siblings] = c.fields(1, 2, 16);
+        c.expect(level == any_level || depth == level, "a node one level below the last");
         for (uint64_t i = 0; i < entries; ++i) {
-            Cursor key = cursor(c.at, key_size);
+            const Cursor key = cursor(c.at, key_size);
             c.take(key_size);
             const uint64_t child = c.number(8);
             if (depth == 0)
@@ -821,36 +781,36 @@ struct Hdf5Parser {
         }
     }
 
-    // SPEC IV.A.2.r, III.D (local heap: the names), III.B (nodes), III.C (entries).
+    // SPEC IV.A.2.r: the message of an old group.
+    //   message      B-tree 8 | local heap 8
+    //   local heap   HEAP 0 | .. 3 | size 8 | free list 8 | names 8, each ended by a NUL                 (III.D)
+    //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 20        (III.B, III.C)
     void symbol_table(std::vector<Link>& links, Cursor message) {
-        const uint64_t tree = message.number(8);
-        Cursor heap = cursor(message.number(8));
+        const auto [tree, heap_address] = message.fields(8, 8);
+        Cursor heap = cursor(heap_address);
         heap.begins("HEAP", 0);
-        heap.take(3);
-        const uint64_t size = heap.number(8);
-        heap.take(8);
-        const Bytes names = bytes(heap.number(8), size);
+        const auto [reserved, size, free, segment] = heap.fields(3, 8, 8, 8);
+        const Bytes names = bytes(segment, size);
         b_tree_1(tree, 0, 8, [&](Cursor, uint64_t node) {
             Cursor c = cursor(node);
             c.begins("SNOD", 1);
-            c.take(1);
-            for (uint64_t n = c.number(2); n > 0; --n) {
-                const uint64_t name = c.number(8), address = c.number(8), kind = c.number(4);
-                c.take(20);
+            const auto [unused, count] = c.fields(1, 2);
+            for (uint64_t n = 0; n < count; ++n) {
+                const auto [name, header, kind, scratch] = c.fields(8, 8, 4, 20);
                 c.expect(name < names.size(), "a name within the heap");
                 const Bytes rest = names.subspan(name);
                 const auto end = std::ranges::find(rest, 0);
                 c.expect(end != rest.end(), "a name that ends");
                 charge(c.at, static_cast<size_t>(end - rest.begin()));
-                if (kind != 2) links.push_back({std::string(rest.begin(), end), address});  // 2: a soft link
+                if (kind != 2) links.push_back({std::string(rest.begin(), end), header});  // 2: a soft link
             }
         });
     }
 
-    // SPEC IV.A.2.g.
+    // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name | address 8
     void link_message(std::vector<Link>& links, Cursor c) {
-        c.expect(c.number(1) == 1, "a link message of version 1");
-        const uint64_t flags = c.number(1);
+        const auto [version, flags] = c.fields(1, 1);
+        c.expect(version == 1, "a link message of version 1");
         const uint64_t type = (flags & 8) != 0 ? c.number(1) : 0;
         c.take(((flags & 4) != 0 ? 8 : 0) + ((flags & 16) != 0 ? 1 : 0));
         const Bytes name = c.take(c.number(uint64_t{1} << (flags & 3)));
@@ -858,130 +818,140 @@ struct Hdf5Parser {
     }
 
     // SPEC III.A.2: a version-2 B-tree. Calls record(cursor) for each record.
+    //   BTHD 0 | type | node size 4 | record size 2 | depth 2 | percents 1, 1 | root 8 | its records 2 | all 8 | sum
+    //   BTLF 0 or BTIN 0 | type | records | in BTIN pointers, one more than records | sum
+    //   pointer   child 8 | its records | records of its subtree; each in as few bytes as its greatest value needs
+    struct Tree2 {
+        uint64_t type, record_size;
+        std::vector<uint64_t> most = {}, subtree_width = {};  // by level: records in a node; bytes of a subtree's count
+        static uint64_t width(uint64_t greatest) { return log2(greatest) / 8 + 1; }
+    };
+
     template <class F>
     void b_tree_2(uint64_t address, uint64_t type, const F& record) {
         Cursor c = cursor(address);
         c.begins("BTHD", 0);
         c.expect(c.number(1) == type, "a B-tree of type " + std::to_string(type));
-        const uint64_t node_size = c.number(4), record_size = c.number(2), depth = c.number(2);
-        c.take(2);
-        const uint64_t root = c.number(8), count = c.number(2);
-        c.take(8);
+        const auto [node_size, record_size, depth, percents, root, count, all] = c.fields(4, 2, 2, 2, 8, 2, 8);
         c.checksum();
         c.expect(record_size > 0 && node_size >= 10 + record_size && depth <= 32, "room for records in a node");
-        // Bytes of a pointer to a child: its address, how many records it has and how many its whole subtree has, each
-        // in as few bytes as the greatest possible number needs.
-        const auto width = [](uint64_t greatest) { return log2(greatest) / 8 + 1; };
-        std::vector<uint64_t> most = {(node_size - 10) / record_size};  // by level: in a node; below: in its subtree
-        std::vector<uint64_t> below = {most[0]}, total_width = {0};
-        for (uint64_t level = 1; level <= depth; ++level) {
-            const uint64_t pointer = 8 + width(most[0]) + total_width.back();
+        Tree2 tree{type, record_size};
+        uint64_t below = 0;  // the most records in a subtree
+        for (uint64_t level = 0; level <= depth; ++level) {
+            uint64_t pointer = 0;
+            if (level > 0) pointer = 8 + Tree2::width(tree.most[0]) + tree.subtree_width.back();
             c.expect(node_size >= 10 + pointer, "room for a pointer in a node");
-            most.push_back((node_size - 10 - pointer) / (record_size + pointer));
-            below.push_back(product(most.back() + 1, below.back(), address) + most.back());
-            total_width.push_back(width(below.back()));
+            tree.most.push_back((node_size - 10 - pointer) / (record_size + pointer));
+            below = product(tree.most.back() + 1, below, address) + tree.most.back();
+            tree.subtree_width.push_back(level == 0 ? 0 : Tree2::width(below));
         }
-        const auto node = [&](const auto& self, uint64_t where, uint64_t n, uint64_t level) -> void {
-            Cursor walk = cursor(where);
-            walk.begins(level == 0 ? "BTLF" : "BTIN", 0);
-            walk.expect(walk.number(1) == type && n <= most[level], "a node of the B-tree's type and size");
-            Cursor records = walk;
-            walk.take(n * record_size);
-            std::vector<std::pair<uint64_t, uint64_t>> children;
-            for (uint64_t i = 0; level > 0 && i <= n; ++i) {
-                const uint64_t child = walk.number(8), child_count = walk.number(width(most[0]));
-                walk.take(total_width[level - 1]);
-                children.emplace_back(child, child_count);
-            }
-            walk.checksum();
-            for (uint64_t i = 0; i < n; ++i, records.at += record_size) record(cursor(records.at, record_size));
-            for (const auto& [child, child_count] : children) self(self, child, child_count, level - 1);
-        };
-        if (root != undefined_address) node(node, root, count, depth);
+        if (root != undefined_address) tree_2_node(tree, root, count, depth, record);
     }
 
-    // SPEC III.G: a fractal heap, whose objects are found by their offset in a space of its own. The blocks that exist:
-    // offset -> (address, size) in the file.
+    template <class F>
+    void tree_2_node(const Tree2& tree, uint64_t address, uint64_t count, uint64_t level, const F& record) {
+        Cursor c = cursor(address);
+        c.begins(level == 0 ? "BTLF" : "BTIN", 0);
+        c.expect(c.number(1) == tree.type && count <= tree.most[level], "a node of the B-tree's type and size");
+        const uint64_t count_width = Tree2::width(tree.most[0]);
+        const uint64_t skipped = level == 0 ? 0 : tree.subtree_width[level - 1];
+        const uint64_t pointers = level == 0 ? 0 : count + 1;
+        Cursor body = c.checked(count * tree.record_size + pointers * (8 + count_width + skipped));
+        for (uint64_t i = 0; i < count; ++i) {
+            record(cursor(body.at, tree.record_size));
+            body.take(tree.record_size);
+        }
+        for (uint64_t i = 0; i < pointers; ++i) {
+            const auto [child, child_count, all] = body.fields(8, count_width, skipped);
+            tree_2_node(tree, child, child_count, level - 1, record);
+        }
+    }
+
+    // SPEC III.G: a fractal heap holds objects, found by their offset in a space of its own, in a doubling table: rows
+    // of `width` blocks, two rows of the smallest size, then each row doubles. Beyond `direct_rows` a block is again
+    // such a table (an indirect block).
+    //   FRHP 0 | ID length 2 | filters 2 | flags | largest object 4 | .. 96 | width 2 | smallest block 8 |
+    //            largest direct block 8 | bits of an offset 2 | .. 2 | root block 8 | its rows 2 | .. | sum
+    //   FHDB 0 | heap 8 | offset | [sum] | objects           FHIB 0 | heap 8 | offset | addresses of blocks | sum
     struct Heap {
-        uint64_t offset_width, length_width;
-        std::map<uint64_t, std::pair<uint64_t, uint64_t>> blocks;
+        uint64_t address, width, smallest, direct_rows, offset_width, length_width;
+        bool checked;                                                   // direct blocks have a checksum
+        std::map<uint64_t, std::pair<uint64_t, uint64_t>> blocks = {};  // offset -> address, size in the file
     };
 
     Heap fractal_heap(uint64_t address) {
         Cursor c = cursor(address);
         c.begins("FRHP", 0);
-        c.take(2);
-        c.expect(c.number(2) == 0, "a heap without filters", "hdf5.unsupported");
-        const uint64_t flags = c.number(1), largest = c.number(4);
-        c.take(96);  // huge and tiny objects, statistics
-        const uint64_t width = c.number(2), smallest_block = c.number(8), largest_block = c.number(8),
-                       bits = c.number(2);
-        c.take(2);
-        const uint64_t root = c.number(8), root_rows = c.number(2);
+        const auto [id_length, filters, flags, most, statistics] = c.fields(2, 2, 1, 4, 96);
+        c.expect(filters == 0, "a heap without filters", "hdf5.unsupported");
+        const auto [width, smallest, largest, bits, first_rows, root, rows] = c.fields(2, 8, 8, 2, 2, 8, 2);
         c.checksum();
-        c.expect(std::has_single_bit(width) && std::has_single_bit(smallest_block) &&
-                     std::has_single_bit(largest_block) && smallest_block <= largest_block && bits <= 64 &&
-                     largest > 0 && largest_block <= uint64_t{1} << 32 && root_rows <= 64,
+        const bool powers = std::has_single_bit(width) && std::has_single_bit(smallest) && std::has_single_bit(largest);
+        c.expect(powers && smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && most > 0 && rows <= 64,
                  "a doubling table of powers of two");
-        Heap heap{(bits + 7) / 8, log2(std::min(largest, largest_block)) / 8 + 1, {}};
-        const uint64_t direct_rows = log2(largest_block) - log2(smallest_block) + 2;
-
-        const auto direct = [&](uint64_t where, uint64_t size, uint64_t offset) {
-            Cursor block = cursor(where);
-            block.begins("FHDB", 0);
-            block.expect(block.number(8) == address, "a block of this heap");
-            block.expect(block.number(heap.offset_width) == offset,
-                         "a block of the heap's offset " + std::to_string(offset));
-            const Bytes all = bytes(where, size);
-            if ((flags & 2) != 0) {  // the checksum is taken with zeros in its own place
-                const uint64_t stored = block.number(4);
-                std::vector<uint8_t> covered(all.begin(), all.end());
-                std::fill_n(covered.begin() + static_cast<ptrdiff_t>(block.at - where - 4), 4, uint8_t{0});
-                block.expect(stored == lookup3(covered), "data that match their checksum", "hdf5.checksum");
-            }
-            heap.blocks[offset] = {where, size};
-        };
-        // Rows of `width` blocks: two rows of the smallest size, then each row doubles. Beyond direct_rows a block is
-        // again such a table.
-        const auto indirect = [&](const auto& self, uint64_t where, uint64_t rows, uint64_t offset) -> void {
-            Cursor block = cursor(where);
-            block.begins("FHIB", 0);
-            block.expect(block.number(8) == address, "a block of this heap");
-            block.expect(block.number(heap.offset_width) == offset,
-                         "a block of the heap's offset " + std::to_string(offset));
-            const Bytes children = block.take(rows * width * 8);
-            block.checksum();
-            for (uint64_t row = 0; row < rows; ++row) {
-                const uint64_t power = log2(smallest_block) + (row == 0 ? 0 : row - 1);
-                block.expect(power < 64, "a heap below 2^64 bytes");
-                for (uint64_t column = 0; column < width; ++column, offset += uint64_t{1} << power) {
-                    const uint64_t child = little_endian(children.subspan((row * width + column) * 8, 8));
-                    if (child == undefined_address) continue;
-                    if (row < direct_rows) {
-                        direct(child, uint64_t{1} << power, offset);
-                    } else {
-                        block.expect(row >= log2(width), "a table smaller than the one it is in");
-                        self(self, child, row - log2(width), offset);
-                    }
-                }
-            }
-        };
-        if (root != undefined_address && root_rows == 0) direct(root, smallest_block, 0);
-        if (root != undefined_address && root_rows > 0) indirect(indirect, root, root_rows, 0);
+        Heap heap{.address = address,
+                  .width = width,
+                  .smallest = smallest,
+                  .direct_rows = log2(largest) - log2(smallest) + 2,
+                  .offset_width = (bits + 7) / 8,
+                  .length_width = log2(std::min(most, largest)) / 8 + 1,
+                  .checked = (flags & 2) != 0};
+        if (root != undefined_address && rows == 0) direct_block(heap, root, smallest, 0);
+        if (root != undefined_address && rows > 0) indirect_block(heap, root, rows, 0);
         return heap;
     }
 
-    // SPEC IV.A.2.c: links beyond a handful lie in a heap, as the same messages, and a B-tree knows where.
+    static void heap_block(const Heap& heap, Cursor& c, std::string_view signature, uint64_t offset) {
+        c.begins(signature, 0);
+        const bool same = c.number(8) == heap.address && c.number(heap.offset_width) == offset;
+        c.expect(same, "a block of the heap at " + std::to_string(heap.address) + ", offset " + std::to_string(offset));
+    }
+
+    void direct_block(Heap& heap, uint64_t address, uint64_t size, uint64_t offset) {
+        Cursor c = cursor(address, size);
+        heap_block(heap, c, "FHDB", offset);
+        const Bytes all = bytes(address, size);
+        if (heap.checked) {  // the checksum is taken with zeros in its own place
+            const uint64_t stored = c.number(4);
+            std::vector<uint8_t> covered(all.begin(), all.end());
+            std::fill_n(&covered[c.at - 4 - address], 4, uint8_t{0});
+            c.expect(stored == lookup3(covered), "data that match their checksum", "hdf5.checksum");
+        }
+        heap.blocks[offset] = {address, size};
+    }
+
+    void indirect_block(Heap& heap, uint64_t address, uint64_t rows, uint64_t offset) {
+        Cursor c = cursor(address);
+        heap_block(heap, c, "FHIB", offset);
+        Cursor children = c.checked(rows * heap.width * 8);
+        for (uint64_t row = 0; row < rows; ++row) {
+            const uint64_t power = log2(heap.smallest) + (row == 0 ? 0 : row - 1);
+            c.expect(power < 64, "a heap below 2^64 bytes");
+            for (uint64_t column = 0; column < heap.width; ++column, offset += uint64_t{1} << power) {
+                const uint64_t child = children.number(8);
+                if (child == undefined_address) continue;
+                if (row < heap.direct_rows) {
+                    direct_block(heap, child, uint64_t{1} << power, offset);
+                    continue;
+                }
+                c.expect(row >= log2(heap.width), "a table smaller than the one it is in");
+                indirect_block(heap, child, row - log2(heap.width), offset);
+            }
+        }
+    }
+
+    // SPEC IV.A.2.c: many links lie in a heap, as the same messages, and a B-tree of type 5 has their places.
+    //   message   0 | flags | [order 8] | heap 8 | B-tree 8 | ..         record   hash of the name 4 | heap ID
+    //   heap ID   kind in bits 4 to 7 (0: in a block) | offset | length
     void dense_links(std::vector<Link>& links, Cursor message) {
-        message.expect(message.number(1) == 0, "a link information message of version 0");
-        message.take((message.number(1) & 1) != 0 ? 8 : 0);
-        const uint64_t heap_address = message.number(8), tree = message.number(8);
+        const auto [version, flags] = message.fields(1, 1);
+        message.expect(version == 0, "a link information message of version 0");
+        const auto [order, heap_address, tree] = message.fields((flags & 1) != 0 ? 8 : 0, 8, 8);
         if (heap_address == undefined_address) return;
         const Heap heap = fractal_heap(heap_address);
-        b_tree_2(tree, 5, [&](Cursor c) {  // III.A.2, type 5: a hash of the name, then a heap ID (III.G)
-            c.take(4);
-            c.expect((c.number(1) & 0xF0) == 0, "a link shorter than 4096 bytes", "hdf5.unsupported");
-            const uint64_t offset = c.number(heap.offset_width), length = c.number(heap.length_width);
+        b_tree_2(tree, 5, [&](Cursor c) {
+            const auto [hash, kind, offset, length] = c.fields(4, 1, heap.offset_width, heap.length_width);
+            c.expect((kind & 0xF0) == 0, "a link shorter than 4096 bytes", "hdf5.unsupported");
             auto block = heap.blocks.upper_bound(offset);
             c.expect(block != heap.blocks.begin(), "a link within the heap");
             --block;
@@ -997,8 +967,7 @@ struct Hdf5Parser {
     // A data set in the making, and what is read of its header but not kept.
     struct Grid {
         Hdf5Dataset d;
-        Shape most;                // the extents to which the data set may grow
-        Shape counts;              // chunks in each dimension
+        Shape most;                // the extents to which the data set may grow; ~0: without limit
         uint64_t all = 1;          // chunks
         bool whole_edges = false;  // chunks that hang over the edge are not filtered
         // Arrays number the chunks row-major, by `most`; if one dimension is unlimited, it counts slowest, whichever it
@@ -1026,192 +995,219 @@ struct Hdf5Parser {
         each(0x0B, [&](Cursor c) { filter_pipeline(d, c); });
         if (d.element.kind == Hdf5Element::other && d.unsupported.empty())
             d.unsupported = "elements of type " + d.type + " are not supported";
-        each(0x04, [&](Cursor c) { fill_value(d, c, 0); });
-        each(0x05, [&](Cursor c) {
-            const uint64_t version = c.number(1);
-            fill_value(d, c, version);
-        });
+        each(0x05, [&](Cursor c) { fill_value(d, c); });
         each(0x08, [&](Cursor c) {
             charge(c.start, sizeof d + path.size());
+            c.expect(d.chunk_bytes == 0, "one layout message");
             if (d.unsupported.empty()) layout(g, c);
         });
         file.datasets.push_back(std::move(d));
     }
 
-    // SPEC IV.A.2.b.
+    // SPEC IV.A.2.b: version | rank | flags | kind | [.. 4] | extents 8 each | [largest extents 8 each]
     void dataspace(Grid& g, Cursor c) {
-        const uint64_t version = c.number(1), rank = c.number(1), flags = c.number(1), kind = c.number(1);
+        Hdf5Dataset& d = g.d;
+        const auto [version, rank, flags, kind] = c.fields(1, 1, 1, 1);
         c.expect((version == 1 || version == 2) && rank <= 32, "a data space of version 1 or 2, up to 32 dimensions");
         if (version == 1) c.take(4);
-        g.d.shape.resize(rank), g.d.elements = 1;
-        for (uint64_t& extent : g.d.shape) extent = c.number(8);
-        g.most = g.d.shape;
+        d.shape.resize(rank);
+        for (uint64_t& extent : d.shape) extent = c.number(8);
+        g.most = d.shape;
         for (uint64_t& extent : g.most) extent = (flags & 1) != 0 ? c.number(8) : extent;
-        if (version == 2 && kind == 2) g.d.shape = g.most = {0};  // no elements, no shape
-        const bool none = std::ranges::find(g.d.shape, 0) != g.d.shape.end();
-        for (const uint64_t extent : g.d.shape) g.d.elements = none ? 0 : product(g.d.elements, extent, c.at);
-        for (size_t k = 0; k < rank && !none; ++k)
-            c.expect(g.d.shape[k] <= g.most[k], "extents that are not above the largest allowed");
+        if (version == 2 && kind == 2) d.shape = g.most = {0};  // no elements, no shape
+        d.elements = std::ranges::count(d.shape, 0) == 0 ? 1 : 0;
+        if (d.elements == 0) return;
+        for (size_t k = 0; k < rank; ++k) {
+            d.elements = product(d.elements, d.shape[k], c.at);
+            c.expect(d.shape[k] <= g.most[k], "extents that are not above the largest allowed");
+        }
     }
 
-    // SPEC IV.A.2.d.
+    // SPEC IV.A.2.d: version, class 4 bits each | flags 3 | size 4 | properties
+    //   class 0, integers      flags: 1 big-endian, 8 signed     properties: first bit 2, bits 2
+    //   class 1, floats        flags: 1 big-endian, 0x20 hidden bit, sign's place from bit 8 on
+    //                          properties: first bit 2, bits 2, exponent: place, bits; mantissa: place, bits; bias 4
+    //   class 3, strings       flags: padding
+    //   class 8, enumerations  flags: members     properties: integer type, names, values; h5py's bool is FALSE, TRUE
     void datatype(Hdf5Dataset& d, Cursor c) {
-        const uint64_t head = c.number(1), bits = c.number(3), size = c.number(4);
+        const auto [head, flags, size] = c.fields(1, 3, 4);
         const uint64_t type = head & 15, version = head >> 4;
+        const std::string bits = std::to_string(8 * size);
         c.expect(version >= 1 && version <= 5 && size > 0, "a data type of version 1 to 5");
         d.element = {.size = size};
         d.type = type == 6 ? "compound" : type == 9 ? "variable length" : "class " + std::to_string(type);
         if (type == 0) {
-            const uint64_t offset = c.number(2), precision = c.number(2);
-            if (size > 8 || offset != 0 || precision != 8 * size) return;
-            d.element.kind = (bits & 8) != 0 ? Hdf5Element::signed_integer : Hdf5Element::unsigned_integer;
-            d.type = ((bits & 8) != 0 ? "int" : "uint") + std::to_string(8 * size);
+            const auto [first, precision] = c.fields(2, 2);
+            if (size > 8 || first != 0 || precision != 8 * size) return;
+            const bool has_sign = (flags & 8) != 0;
+            d.element.kind = has_sign ? Hdf5Element::signed_integer : Hdf5Element::unsigned_integer;
+            d.type = (has_sign ? "int" : "uint") + bits;
         } else if (type == 1) {
-            const Bytes layout = c.take(12);  // offset, precision; exponent: place, bits; mantissa: place, bits; bias
-            constexpr uint8_t single[] = {0, 0, 32, 0, 23, 8, 0, 23, 127, 0, 0, 0};
-            constexpr uint8_t twice[] = {0, 0, 64, 0, 52, 11, 0, 52, 255, 3, 0, 0};
-            const bool ieee =
-                size == 4 ? std::ranges::equal(layout, single) : size == 8 && std::ranges::equal(layout, twice);
-            if (!ieee || (bits & 0x70) != 0x20 || bits >> 8 != 8 * size - 1) return;  // order, hidden bit; sign
+            constexpr std::array<uint8_t, 12> single = {0, 0, 32, 0, 23, 8, 0, 23, 127, 0, 0, 0};
+            constexpr std::array<uint8_t, 12> twice = {0, 0, 64, 0, 52, 11, 0, 52, 255, 3, 0, 0};
+            const bool ieee = (size == 4 || size == 8) && std::ranges::equal(c.take(12), size == 4 ? single : twice);
+            if (!ieee || (flags & 0x70) != 0x20 || flags >> 8 != 8 * size - 1) return;
             d.element.kind = Hdf5Element::floating;
-            d.type = "float" + std::to_string(8 * size);
+            d.type = "float" + bits;
         } else if (type == 3) {
-            if ((bits & 15) > 2) return;
+            if ((flags & 15) > 2) return;
             d.element.kind = Hdf5Element::text;
-            d.element.padding = static_cast<uint8_t>(bits & 15);
             d.type = "text of " + std::to_string(size) + " bytes";
-        } else if (type == 8) {  // an integer type, then the names, then the values; h5py's bool has two
+        } else if (type == 8) {
             Cursor base = c;
             if ((base.number(1) & 15) != 0) return;
             datatype(d, c);
-            c.take(12);
-            const Bytes rest = cursor(c.at, c.end - c.at).take(std::min<uint64_t>(6, c.end - c.at));
-            const bool boolean = bits == 2 && size == 1 && std::ranges::equal(rest, as_bytes({"FALSE", 6}));
+            c.take(12);  // the integer type
+            const Bytes names = c.take(std::min<uint64_t>(6, c.end - c.at));
+            const bool boolean = flags == 2 && size == 1 && std::ranges::equal(names, as_bytes({"FALSE", 6}));
             if (d.element.kind != Hdf5Element::other) d.type = boolean ? "bool" : "enumeration " + d.type;
             return;
         }
-        d.element.big_endian = type < 2 && (bits & 1) != 0 && size > 1;
+        d.element.big_endian = type < 2 && (flags & 1) != 0 && size > 1;
         if (d.element.big_endian) d.type += ", big-endian";
     }
 
-    // SPEC IV.A.2.e (here version 0) and f.
-    void fill_value(Hdf5Dataset& d, Cursor c, uint64_t version) {
-        c.expect(version <= 3, "a fill value of version 1 to 3");
-        c.take(version == 1 || version == 2 ? 2 : 0);
-        const uint64_t flags = version == 0 ? 0 : c.number(1);
-        const bool defined = version == 3 ? (flags & 32) != 0 : version < 2 || flags != 0;
+    // SPEC IV.A.2.f. Version 1, 2: version | when to write 2 | defined? | size 4 | value. Version 3: flags for the two.
+    void fill_value(Hdf5Dataset& d, Cursor c) {
+        const uint64_t version = c.number(1);
+        c.expect(version >= 1 && version <= 3, "a fill value of version 1 to 3");
+        c.take(version == 3 ? 0 : 2);
+        const uint64_t flags = c.number(1);
+        const bool defined = version == 3 ? (flags & 32) != 0 : version == 1 || flags != 0;
         const uint64_t size = defined ? c.number(4) : 0;
         if (size == 0 || !d.unsupported.empty()) return;
         c.expect(size == d.element.size, "a fill value of the data's type");
         d.fill = c.take(size);
     }
 
-    // SPEC IV.A.2.l.
+    // SPEC IV.A.2.l: version | count | [.. 6] | filters: ID 2, [length of the name 2], flags 2, values 2, name, values
     void filter_pipeline(Hdf5Dataset& d, Cursor c) {
-        const uint64_t version = c.number(1), count = c.number(1);
+        const auto [version, count] = c.fields(1, 1);
         d.filters.clear();
         c.expect((version == 1 || version == 2) && count <= 32, "a list of up to 32 filters, version 1 or 2");
         if (version == 1) c.take(6);
         for (uint64_t i = 0; i < count; ++i) {
             const uint64_t id = c.number(2), name = version == 1 || id >= 256 ? c.number(2) : 0;
-            c.take(2);
-            const uint64_t values = c.number(2);
-            c.take(version == 1 ? (name + 7) / 8 * 8 : name);
-            c.take(4 * values + (version == 1 && values % 2 == 1 ? 4 : 0));
+            const auto [flags, values] = c.fields(2, 2);
+            c.take(version == 1 ? quotient(name, 8) * 8 : name);
+            c.take(4 * (version == 1 ? quotient(values, 2) * 2 : values));
             if (id < 1 || id > 3) d.unsupported = "filter " + std::to_string(id) + " is not supported";
             d.filters.push_back(static_cast<Hdf5Filter>(id));
         }
         if (std::ranges::count(d.filters, Hdf5Filter::deflate) > 1) d.unsupported = "it is compressed twice";
     }
 
-    // SPEC IV.A.2.i, versions 3 and 4; HDF5 2.0 writes 5, which is the same but for the width of a size in an index, and
-    // that is told by the index itself.
+    // SPEC IV.A.2.i, versions 3 and 4. HDF5 2.0 writes 5, which differs in the width of a size in an index alone; the
+    // index itself tells that width.
+    //   class 0, compact      size 2 | data
+    //   class 1, contiguous   address 8 | size 8
+    //   class 2, version 3    rank + 1 | B-tree 8 | chunk extents 4 each, then the element's size
+    //            version 4    flags | rank + 1 | width | chunk extents, then the element's size | index type 1..5 |
+    //                         what the index needs | address 8
     void layout(Grid& g, Cursor c) {
-        Hdf5Dataset& d = g.d;
-        const uint64_t version = c.number(1), kind = c.number(1);
+        const auto [version, kind] = c.fields(1, 1);
         if (version < 3 || version > 5 || kind > 2) {
-            d.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
+            g.d.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
             return;
         }
-        // Deflate shrinks at most 1032-fold; data that are all fill value take nothing.
+        const uint64_t total = bounded(g.d.elements, g.d.element.size, c);
+        kind == 2 ? chunked(g, c, version) : one_run(g, c, kind == 0, total);
+    }
+
+    // Returns count * size, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are
+    // all fill value take nothing. Errors: hdf5.too_large.
+    uint64_t bounded(uint64_t count, uint64_t size, const Cursor& c) const {
         const uint64_t limit = std::min<uint64_t>(uint64_t{1} << 34, 1040 * file.bytes.size() + (1 << 26));
-        const auto bounded = [&](uint64_t count, uint64_t size) {
-            const uint64_t total = product(count, size, c.at);
-            c.expect(total <= limit, "at most " + std::to_string(limit) + " bytes in a file so small",
-                     "hdf5.too_large");
-            return total;
-        };
-        const uint64_t rank = d.shape.size(), total = bounded(d.elements, d.element.size);
-        if (kind < 2) {  // in the header, or in one run elsewhere
-            d.filters.clear();
-            d.chunk = d.shape;
-            d.chunk_bytes = total;
-            const uint64_t before = c.number(kind == 0 ? 2 : 8), size = kind == 0 ? before : c.number(8);
-            const uint64_t address = kind == 0 ? c.at : before;
-            if (total == 0 || address == undefined_address) return;
-            c.expect(size >= total, std::to_string(total) + " bytes of data");
-            return add(g, {}, {address, total, 0, 0}, c.start);
-        }
+        const uint64_t total = product(count, size, c.at);
+        c.expect(total <= limit, "at most " + std::to_string(limit) + " bytes in a file so small", "hdf5.too_large");
+        return total;
+    }
+
+    void one_run(Grid& g, Cursor c, bool compact, uint64_t total) {
+        g.d.filters.clear();
+        g.d.chunk = g.d.shape;
+        g.d.chunk_bytes = total;
+        uint64_t address = undefined_address, size = 0;
+        if (!compact) address = c.number(8);
+        size = c.number(compact ? 2 : 8);
+        if (compact) address = c.at;
+        if (total == 0 || address == undefined_address) return;
+        c.expect(size >= total, std::to_string(total) + " bytes of data");
+        add(g, {}, {address, total, 0, 0}, c.start);
+    }
+
+    void chunked(Grid& g, Cursor c, uint64_t version) {
+        Hdf5Dataset& d = g.d;
+        const size_t rank = d.shape.size();
         const uint64_t flags = version == 3 ? 0 : c.number(1), extents = c.number(1);
         const uint64_t tree = version == 3 ? c.number(8) : 0, width = version == 3 ? 4 : c.number(1);
         c.expect(extents == rank + 1 && width >= 1 && width <= 8, "chunks of as many dimensions as the data");
         d.chunk_bytes = d.element.size;
-        for (uint64_t k = 0; k < rank; ++k) {
+        for (size_t k = 0; k < rank; ++k) {
             d.chunk.push_back(c.number(width));
             c.expect(d.chunk[k] > 0, "chunks that are not empty");
             d.chunk_bytes = product(d.chunk_bytes, d.chunk[k], c.at);
-            g.counts.push_back(quotient(d.shape[k], d.chunk[k]));
-            g.all = d.elements == 0 ? 0 : product(g.all, g.counts[k], c.at);
+            d.counts.push_back(quotient(d.shape[k], d.chunk[k]));
+            g.all = d.elements == 0 ? 0 : product(g.all, d.counts[k], c.at);
         }
         c.expect(c.number(width) == d.element.size, "chunks of the data's elements");
-        bounded(g.all, d.chunk_bytes);
-        if (d.elements == 0) return;
+        bounded(g.all, d.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
-        if (version == 3) return b_tree_1_index(g, tree);
+        if (d.elements == 0) return;
+        if (version == 3)
+            b_tree_1_index(g, tree);
+        else
+            chunk_index(g, c, (flags & 2) != 0);
+    }
 
+    // SPEC VII. `filtered` matters for a single chunk alone; the parameters of the others are repeated in the index.
+    void chunk_index(Grid& g, Cursor c, bool filtered) {
+        const size_t rank = g.d.shape.size();
         const uint64_t index = c.number(1);
         c.expect(index >= 1 && index <= 5, "a chunk index of type 1 to 5");
-        Hdf5Chunk single{0, d.chunk_bytes, 0, 0};
-        if (index == 1 && (flags & 2) != 0)
-            single.size = c.number(8), single.skipped = static_cast<uint32_t>(c.number(4));
-        c.take(index < 3 ? 0 : index == 3 ? 1 : index == 4 ? 5 : 6);  // repeated in the index itself
+        Hdf5Chunk single{0, g.d.chunk_bytes, 0, 0};
+        if (index == 1 && filtered) {
+            single.size = c.number(8);
+            single.skipped = static_cast<uint32_t>(c.number(4));
+        }
+        constexpr uint64_t parameters[] = {0, 0, 0, 1, 5, 6};  // bytes, by index type
+        c.take(parameters[index]);
         single.address = c.number(8);
         if (single.address == undefined_address) return;
-        if (index == 1) return add(g, Shape(rank, 0), single, c.start);  // VII.A
+        if (index == 1) return add(g, Shape(rank, 0), single, c.start);
         if (index == 5) return b_tree_2_index(g, single.address);
-        for (size_t k = 0; k < rank; ++k) g.order.insert(g.most[k] == no_limit ? g.order.begin() : g.order.end(), k);
+        for (size_t k = 0; k < rank; ++k)
+            g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
         g.step.assign(rank, 1);
         for (size_t k = rank; k-- > 1;)
-            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], d.chunk[g.order[k]]), c.at);
+            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.d.chunk[g.order[k]]), c.at);
         if (index == 2) return implicit_index(g, single.address);
         index == 3 ? fixed_array(g, single.address) : extensible_array(g, single.address);
     }
-
-    static uint64_t quotient(uint64_t a, uint64_t b) { return a / b + (a % b != 0 ? 1 : 0); }  // rounded up
 
     // `place`: which chunk, in each dimension. Those beyond the edge are left over from when the data set was larger.
     void add(Grid& g, const Shape& place, Hdf5Chunk chunk, uint64_t offset) {
         if (chunk.address == undefined_address) return;
         bool partial = false;
         for (size_t k = 0; k < place.size(); ++k) {
-            if (place[k] >= g.counts[k]) return;
-            chunk.place = chunk.place * g.counts[k] + place[k];
+            if (place[k] >= g.d.counts[k]) return;
+            chunk.place = chunk.place * g.d.counts[k] + place[k];
             partial = partial || g.d.shape[k] - place[k] * g.d.chunk[k] < g.d.chunk[k];
         }
         if (g.whole_edges && partial) chunk.skipped = ~0u;
         if (g.d.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
-        bytes(chunk.address, chunk.size), budget += chunk.size;
+        require_inside(chunk.address, chunk.size);
         charge(offset, sizeof chunk);
         g.d.chunks.push_back(chunk);
         g.d.stored += chunk.size;
     }
 
-    // SPEC III.A.1, node type 1: a key is the chunk's size, skipped filters, and first element.
+    // SPEC III.A.1, node type 1. A key: the chunk's size 4, skipped filters 4, its first element 8 each.
     void b_tree_1_index(Grid& g, uint64_t address) {
         Shape place(g.d.shape.size());
         if (address == undefined_address) return;
         b_tree_1(address, 1, 16 + 8 * place.size(), [&](Cursor key, uint64_t chunk) {
-            const uint64_t size = key.number(4), skipped = key.number(4);
+            const auto [size, skipped] = key.fields(4, 4);
             for (size_t k = 0; k < place.size(); ++k) {
                 const uint64_t first = key.number(8);
                 key.expect(first % g.d.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
@@ -1221,144 +1217,159 @@ struct Hdf5Parser {
         });
     }
 
-    // SPEC VII.E; III.A.2, types 10 and 11.
+    // SPEC VII.E; III.A.2, types 10 and 11. A record: an entry as below, then the chunk's place 8 each.
     void b_tree_2_index(Grid& g, uint64_t address) {
         Shape place(g.d.shape.size());
         b_tree_2(address, g.d.filters.empty() ? 10 : 11, [&](Cursor c) {
-            const Hdf5Chunk chunk = array_element(g, c, c.end - c.at - 8 * place.size());
+            const Hdf5Chunk chunk = index_entry(g, c, c.end - c.at - 8 * place.size());
             for (uint64_t& coordinate : place) coordinate = c.number(8);
             add(g, place, chunk, c.start);
         });
     }
 
-    // An entry of an index, of `size` bytes: the address, and if there are filters the size and those skipped.
-    static Hdf5Chunk array_element(const Grid& g, Cursor& c, uint64_t size) {
+    // An entry of an index has `size` bytes: address 8, and with filters the chunk's size 1..8 and those skipped 4.
+    static Hdf5Chunk index_entry(const Grid& g, Cursor& c, uint64_t size) {
         const bool filtered = !g.d.filters.empty();
-        c.expect(filtered ? size > 12 && size <= 20 : size == 8,
-                 "an index of entries of 8 bytes, or with filters 13 to 20");
+        c.expect(filtered ? size > 12 && size <= 20 : size == 8, "entries of 8 bytes, or with filters of 13 to 20");
         const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.d.chunk_bytes;
         return {address, stored, 0, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
     }
 
-    // Entries `first` to `first + count` from `c` on.
-    void elements(Grid& g, Cursor& c, uint64_t size, uint64_t first, uint64_t count) {
-        Shape place(g.order.size());
-        for (uint64_t i = 0; i < count; ++i) {
-            const Hdf5Chunk chunk = array_element(g, c, size);
-            uint64_t number = first + i;
-            for (size_t k = 0; k < place.size(); number %= g.step[k], ++k) place[g.order[k]] = number / g.step[k];
-            add(g, place, chunk, c.start);
-        }
-    }
-
-    // Pages of entries from `address` on, the last one possibly shorter. `bit`: that of the first page.
-    void pages_of_elements(Grid& g, uint64_t address, uint64_t size, uint64_t first, uint64_t count, uint64_t page,
-                           Bytes written, uint64_t bit) {
-        for (uint64_t p = 0; p < quotient(count, page); ++p, ++bit) {
-            const uint64_t here = std::min(page, count - p * page);
-            if ((written[bit / 8] << (bit % 8) & 0x80) != 0) {
-                Cursor c = cursor(address);
-                elements(g, c, size, first + p * page, here);
-                c.checksum();
-            }
-            address += product(here, size, address) + 4;
-        }
-    }
-
-    // SPEC VII.B: one after the other, no index.
+    // SPEC VII.B: chunk after chunk, without an index.
     void implicit_index(Grid& g, uint64_t address) {
         Shape place(g.order.size());
         for (uint64_t i = 0; i < g.all; ++i) {
-            for (size_t k = place.size(), rest = i; k-- > 0; rest /= g.counts[k]) place[k] = rest % g.counts[k];
-            uint64_t number = 0;
+            uint64_t number = 0, rest = i;
+            for (size_t k = place.size(); k-- > 0; rest /= g.d.counts[k]) place[k] = rest % g.d.counts[k];
             for (size_t k = 0; k < place.size(); ++k) number += place[g.order[k]] * g.step[k];
             const uint64_t begin = address + product(number, g.d.chunk_bytes, address);
             add(g, place, {begin, g.d.chunk_bytes, 0, 0}, address);
         }
     }
 
-    // The start that an array's header (`header` is 0) and blocks have in common.
-    Cursor array_block(const Grid& g, uint64_t address, std::string_view signature, uint64_t header) {
+    // The index is an array of entries, numbered from 0. Its header and blocks (SPEC VII.C and D) begin alike:
+    //   letters 0 | filtered? | in blocks: the header's address 8 | ...
+    // and hold `count` entries from number `first` on, in pages (each with a checksum) if they are more than a page.
+    struct EntryArray {
+        uint64_t address, size, page;  // of the header; bytes of an entry; entries of a page
+        uint64_t used;                 // 1 + the highest number stored
+    };
+
+    Cursor array_block(const Grid& g, uint64_t address, std::string_view letters, uint64_t header) {
         Cursor c = cursor(address);
-        c.begins(signature, 0);
+        c.begins(letters, 0);
         c.expect(c.number(1) == (g.d.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
         c.expect(header == 0 || c.number(8) == header, "a block of the index at " + std::to_string(header));
         return c;
     }
 
+    void entries(Grid& g, const EntryArray& array, Cursor& c, uint64_t first, uint64_t count) {
+        Shape place(g.order.size());
+        for (uint64_t i = 0; i < count; ++i) {
+            const Hdf5Chunk chunk = index_entry(g, c, array.size);
+            uint64_t number = first + i;
+            for (size_t k = 0; k < place.size(); ++k) {
+                place[g.order[k]] = number / g.step[k];
+                number %= g.step[k];
+            }
+            add(g, place, chunk, c.start);
+        }
+    }
+
+    // `written`: a bit for each page, the highest of a byte first; page 0 has bit number `bit`.
+    void pages(Grid& g, const EntryArray& array, uint64_t address, uint64_t first, uint64_t count, Bytes written,
+               uint64_t bit) {
+        for (uint64_t done = 0; done < count; ++bit) {
+            const uint64_t here = std::min(array.page, count - done), bytes_here = product(here, array.size, address);
+            if ((written[bit / 8] << (bit % 8) & 0x80) != 0) {
+                Cursor c = cursor(address).checked(bytes_here);
+                entries(g, array, c, first + done, here);
+            }
+            address += bytes_here + 4;
+            done += here;
+        }
+    }
+
     // SPEC VII.C.
+    //   FAHD ..  entry size 1 | bits of a page's entries 1 | entries 8 | block 8 | sum
+    //   FADB ..  entries | sum     or, with pages     bits of the pages | sum | pages
     void fixed_array(Grid& g, uint64_t address) {
         Cursor c = array_block(g, address, "FAHD", 0);
-        const uint64_t size = c.number(1), page_bits = c.number(1), count = c.number(8), block = c.number(8);
+        const auto [size, page_bits, count, block] = c.fields(1, 1, 8, 8);
         c.checksum();
         c.expect(page_bits < 64, "pages below 2^64 entries");
         if (block == undefined_address) return;
+        const EntryArray array{address, size, uint64_t{1} << page_bits, count};
         Cursor data = array_block(g, block, "FADB", address);
-        const uint64_t page = uint64_t{1} << page_bits;
-        if (count <= page) elements(g, data, size, 0, count);
-        const Bytes written = data.take(count <= page ? 0 : quotient(quotient(count, page), 8));  // highest bit first
-        data.checksum();
-        if (count > page) pages_of_elements(g, data.at, size, 0, count, page, written, 0);
+        if (count <= array.page) {
+            Cursor body = data.checked(product(size, count, block));
+            return entries(g, array, body, 0, count);
+        }
+        const uint64_t bitmap = quotient(quotient(count, array.page), 8);
+        const Bytes written = data.checked(bitmap).take(bitmap);
+        pages(g, array, data.at, 0, count, written, 0);
     }
 
-    // SPEC VII.D. Entries lie in the index block (the first few), in data blocks it points to, and in data blocks that
-    // secondary blocks point to. Super block u stands for 2^(u/2) data blocks of 2^((u+1)/2) times the least size.
+    // SPEC VII.D. Entries lie in the index block (the first few), in data blocks to which it points, and in data blocks
+    // to which secondary blocks point. Level u stands for 2^(u/2) data blocks of 2^((u+1)/2) times the least size; the
+    // first levels have no secondary block.
+    //   EAHD ..  entry size 1 | bits of a number 1 | entries of the index block 1 | least entries of a data block 1 |
+    //            least pointers of a secondary block 1 | bits of a page's entries 1 | .. 32 | used 8 | .. 8 |
+    //            index block 8 | sum
+    //   EAIB ..  entries | data blocks 8 each | secondary blocks 8 each | sum
+    //   EASB ..  number of its first entry | bits of the pages | data blocks 8 each | sum
+    //   EADB ..  number of its first entry | entries | sum     or, with pages     .. | sum | pages
     void extensible_array(Grid& g, uint64_t address) {
         Cursor c = array_block(g, address, "EAHD", 0);
-        const uint64_t size = c.number(1), bits = c.number(1), direct = c.number(1), least = c.number(1);
-        const uint64_t pointers = c.number(1), page_bits = c.number(1);
-        c.take(32);
-        const uint64_t used = c.number(8);  // 1 + the highest number stored
-        c.take(8);
-        const uint64_t block = c.number(8);
+        const auto [size, bits, direct, least, pointers, page_bits] = c.fields(1, 1, 1, 1, 1, 1);
+        const auto [statistics, used, realized, block] = c.fields(32, 8, 8, 8);
         c.checksum();
-        c.expect(std::has_single_bit(least) && std::has_single_bit(pointers) && pointers > 1 && log2(least) <= bits &&
-                     bits <= 48 && page_bits < 48,
+        const bool powers = std::has_single_bit(least) && std::has_single_bit(pointers) && pointers > 1;
+        c.expect(powers && log2(least) <= bits && bits <= 48 && page_bits < 48,
                  "an index of at most 2^48 chunks in blocks of powers of two");
         if (block == undefined_address) return;
-        const uint64_t page = uint64_t{1} << page_bits, offset_width = (bits + 7) / 8;
-        const uint64_t super_blocks = 1 + bits - log2(least), in_index = std::min(super_blocks, 2 * log2(pointers));
-        Cursor index = array_block(g, block, "EAIB", address);
-        elements(g, index, size, 0, direct);
-        Cursor check = index;  // the whole block before what it points to
-        check.take(8 * (2 * (pointers - 1) + super_blocks - in_index));
-        check.checksum();
+        const EntryArray array{address, size, uint64_t{1} << page_bits, used};
+        const uint64_t levels = 1 + bits - log2(least), in_index = std::min(levels, 2 * log2(pointers));
+        const uint64_t offset_width = (bits + 7) / 8;
+        Cursor index = array_block(g, block, "EAIB", address)
+                           .checked(direct * size + 8 * (2 * (pointers - 1) + levels - in_index));
+        entries(g, array, index, 0, direct);
         uint64_t first = direct;
-        for (uint64_t u = 0; u < super_blocks && first < used; ++u) {
-            const uint64_t blocks = uint64_t{1} << (u / 2), entries = (uint64_t{1} << ((u + 1) / 2)) * least;
-            const uint64_t pages = entries > page ? entries / page : 0;
-            const bool secondary = u >= in_index;
-            const uint64_t super_block = secondary ? index.number(8) : block;
-            if (super_block == undefined_address) {
-                first += blocks * entries;
-                continue;
+        for (uint64_t u = 0; u < levels && first < used; ++u) {
+            const uint64_t blocks = uint64_t{1} << (u / 2), count = (uint64_t{1} << ((u + 1) / 2)) * least;
+            const uint64_t n_pages = count > array.page ? count / array.page : 0;
+            if (u < in_index) {
+                index.expect(n_pages == 0, "pages only below secondary blocks");
+                for (uint64_t b = 0; b < blocks; ++b)
+                    data_block(g, array, index.number(8), offset_width, first + b * count, count, {}, 0);
+            } else if (const uint64_t secondary = index.number(8); secondary != undefined_address) {
+                const uint64_t bitmap = blocks * quotient(n_pages, 8);
+                Cursor s = array_block(g, secondary, "EASB", address).checked(offset_width + bitmap + 8 * blocks);
+                s.take(offset_width);
+                const Bytes written = s.take(bitmap);
+                for (uint64_t b = 0; b < blocks; ++b)
+                    data_block(g, array, s.number(8), offset_width, first + b * count, count, written, b * n_pages);
             }
-            Cursor from = secondary ? array_block(g, super_block, "EASB", address) : index;
-            Bytes written;  // bits, highest first
-            if (secondary) {
-                from.take(offset_width);
-                written = from.take(blocks * quotient(pages, 8));
-                Cursor whole = from;
-                whole.take(8 * blocks);
-                whole.checksum();
-            } else {
-                from.expect(pages == 0, "pages only below secondary blocks");
-                index.take(8 * blocks);
-            }
-            for (uint64_t b = 0; b < blocks; ++b, first += entries) {
-                const uint64_t data_block = from.number(8);
-                if (data_block == undefined_address || first >= used) continue;
-                Cursor data = array_block(g, data_block, "EADB", address);
-                data.take(offset_width);
-                if (pages == 0) elements(g, data, size, first, entries);
-                data.checksum();
-                if (pages > 0) pages_of_elements(g, data.at, size, first, entries, page, written, b * pages);
-            }
+            first += blocks * count;
         }
+    }
+
+    void data_block(Grid& g, const EntryArray& array, uint64_t address, uint64_t offset_width, uint64_t first,
+                    uint64_t count, Bytes written, uint64_t bit) {
+        if (address == undefined_address || first >= array.used) return;
+        Cursor c = array_block(g, address, "EADB", array.address);
+        const bool paged = count > array.page;
+        Cursor body = c.checked(offset_width + (paged ? 0 : count * array.size));
+        body.take(offset_width);
+        if (paged)
+            pages(g, array, c.at, first, count, written, bit);
+        else
+            entries(g, array, body, first, count);
     }
 };
 
-// Reads everything but the data. `owner` keeps the bytes alive.
+// Reads everything but the data. `owner` keeps the bytes alive; `path` is for messages. Errors: hdf5.format,
+// hdf5.truncated, hdf5.cycle, hdf5.checksum, hdf5.too_large, hdf5.unsupported.
 inline Hdf5File parse_hdf5(Bytes bytes, std::shared_ptr<const void> owner, const std::string& path) {
     Hdf5File file{path, std::move(owner), bytes, {}};
     Hdf5Parser{file}.superblock();
@@ -1366,53 +1377,44 @@ inline Hdf5File parse_hdf5(Bytes bytes, std::shared_ptr<const void> owner, const
 }
 
 inline Hdf5File open_hdf5(const std::string& path) {
-    const auto mapped = std::make_shared<const MappedFile>(path);
-    return parse_hdf5(mapped->bytes, mapped, path);
+    const auto owner = std::make_shared<const std::string>(read_file(path));
+    return parse_hdf5(as_bytes(*owner), owner, path);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Writing. The oldest form, which every version of HDF5 reads: superblock 0, groups as symbol tables, data in one run
-// each, uncompressed. Data go to the disk as they come; what describes them follows at the end, and the superblock is
-// written last.
+// Writing the oldest form, which every version of HDF5 reads: superblock 0, groups as symbol tables, data in one run
+// each, uncompressed. Data go to the disk as they come; the structures that describe them follow, the superblock last.
+//
+//   0             96                                                                            end
+//   | superblock | data | data | ... | header of a data set | ... | names, heap, node, tree, header of a group | ...
 //
 //   Hdf5Writer file("out.hdf5");
 //   file.add("actions", {n, 3}, actions);     any vector, array or span; or, for data that come in parts:
 //   file.begin<float>("observations", {n, 11}), file.append(part1), file.append(part2), ...
 //   file.text("metadata/algorithm", "SAC");
 //   file.close();                                                     without it no file appears
-
 class Hdf5Writer {
   public:
-    explicit Hdf5Writer(const std::string& path)
-        : path_(path),
-          temporary_(path + ".tmp"),
-          file_(::open(temporary_.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666)) {
-        if (file_.fd < 0) fail_file("file.write", "create it", temporary_);
-        put(std::string(superblock_size, '\0'));
-    }
-    Hdf5Writer(const Hdf5Writer&) = delete;
-    Hdf5Writer& operator=(const Hdf5Writer&) = delete;
-    ~Hdf5Writer() {
-        if (!closed_) ::unlink(temporary_.c_str());
-    }
+    explicit Hdf5Writer(const std::string& path) : file_(path) { put(std::string(superblock_size, '\0')); }
 
     // T: float, double, int32_t, or uint8_t for booleans (0 or 1). Groups come into being with what they hold.
+    // Errors: hdf5.name, hdf5.shape (also if the data set before is not complete).
     template <class T>
     void begin(const std::string& name, const Shape& shape) {
         begin_raw(name, shape, std::string(type_of<T>()), sizeof(T));
     }
 
-    // The next elements, row-major; of the type given to begin.
+    // Adds the next elements, row-major, of the type given to begin. Errors: hdf5.shape, hdf5.flag.
     template <std::ranges::contiguous_range Range>
     void append(const Range& range) {
         const std::span data(range);
         using T = std::ranges::range_value_t<Range>;
         if (type_ != type_of<T>() || data.size_bytes() > missing_)
-            fail("hdf5.shape", "%s: %s: %zu bytes are more than the %zu that its shape leaves, or of another type",
-                 path_.c_str(), json_string(name_).c_str(), data.size_bytes(), missing_);
+            refuse("hdf5.shape", std::to_string(data.size_bytes()) + " bytes are more than the " +
+                                     std::to_string(missing_) + " that its shape leaves, or of another type");
         if constexpr (std::is_same_v<T, uint8_t>)
             if (std::ranges::any_of(data, [](uint8_t flag) { return flag > 1; }))
-                fail("hdf5.flag", "%s: %s: a flag is neither 0 nor 1", path_.c_str(), json_string(name_).c_str());
+                refuse("hdf5.flag", "a flag is neither 0 nor 1");
         put({reinterpret_cast<const char*>(data.data()), data.size_bytes()});
         missing_ -= data.size_bytes();
     }
@@ -1423,7 +1425,7 @@ class Hdf5Writer {
         append(data);
     }
 
-    // A scalar of fixed length, filled up with NULs.
+    // Writes a scalar string of fixed length, filled up with NULs.
     void text(const std::string& name, const std::string& text) {
         const size_t size = std::max<size_t>(text.size(), 1);  // HDF5 has no empty types
         begin_raw(name, {}, std::string("\x13\1\0\0", 4) + little(size, 4), size);
@@ -1438,13 +1440,9 @@ class Hdf5Writer {
                                   little(tree_k, 2) + little(0, 4 + 8) + none + little(position_, 8) + none +
                                   little(0, 8) + root;  // SPEC II.A, version 0
         flush();
-        if (::lseek(file_.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", temporary_);
-        write_all(file_, start, temporary_);
-        sync_to_disk(file_, temporary_);
-        if (::rename(temporary_.c_str(), path_.c_str()) != 0)
-            fail_file("file.write", "rename its temporary file to it", path_);
-        closed_ = true;
-        sync_folder_of(path_);
+        if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.temporary);
+        file_.write(start);
+        file_.commit();
     }
 
   private:
@@ -1456,7 +1454,8 @@ class Hdf5Writer {
     static constexpr size_t superblock_size = 96, tree_k = 16, buffer_size = 1 << 20;
     inline static const std::string none = std::string(8, '\xFF');  // the undefined address
 
-    template <class T>  // SPEC IV.A.2.d: class, bits, size, then what the class needs
+    // SPEC IV.A.2.d: a datatype message's class, flags, size and properties, as Hdf5Parser::datatype describes them.
+    template <class T>
     static std::string_view type_of() {
         using namespace std::string_view_literals;
         if constexpr (std::is_same_v<T, float>) return "\x11\x20\x1F\0\4\0\0\0\0\0\x20\0\x17\x08\0\x17\x7F\0\0\0"sv;
@@ -1466,30 +1465,34 @@ class Hdf5Writer {
             return "\x18\2\0\0\1\0\0\0\x10\x08\0\0\1\0\0\0\0\0\x08\0FALSE\0\0\0TRUE\0\0\0\0\0\1"sv;
     }  // any other type does not compile: no return
 
+    [[noreturn]] void refuse(const char* id, const std::string& why) const {
+        fail(id, "%s: %s: %s", file_.path.c_str(), json_string(name_).c_str(), why.c_str());
+    }
     static std::string little(uint64_t value, size_t size) {  // least significant byte first
         std::string bytes(size, '\0');
-        for (char& byte : bytes) byte = static_cast<char>(value), value >>= 8;
+        std::memcpy(bytes.data(), &value, std::min<size_t>(size, 8));
         return bytes;
     }
     void put(std::string_view bytes) {
         if (buffer_.size() + bytes.size() > buffer_size) flush();
         if (bytes.size() > buffer_size)
-            write_all(file_, bytes, temporary_);
+            file_.write(bytes);
         else
             buffer_ += bytes;
         position_ += bytes.size();
     }
     void flush() {
-        write_all(file_, buffer_, temporary_);
+        file_.write(buffer_);
         buffer_.clear();
     }
-    uint64_t place(std::string_view bytes) {  // at a multiple of 8
+    // Puts the bytes at a multiple of 8 and returns their address.
+    uint64_t place(std::string_view bytes) {
         put(std::string((8 - position_ % 8) % 8, '\0'));
         put(bytes);
         return position_ - bytes.size();
     }
 
-    // SPEC IV.A.1.a: an object header. Messages are filled up to a multiple of 8 bytes.
+    // Returns an object header (SPEC IV.A.1.a). Messages are filled up to a multiple of 8 bytes.
     static std::string header(const std::vector<std::pair<uint64_t, std::string>>& messages) {
         std::string body;
         for (const auto& [type, data] : messages) {
@@ -1507,39 +1510,41 @@ class Hdf5Writer {
         std::string space = little(1, 1) + little(shape.size(), 1) + little(0, 6);
         for (const uint64_t extent : shape) {
             if (__builtin_mul_overflow(missing_, extent, &missing_) || shape.size() > 32)
-                fail("hdf5.shape", "%s: %s: shape %s is too large", path_.c_str(), json_string(name).c_str(),
-                     shape_text(shape).c_str());
+                refuse("hdf5.shape", "shape " + shape_text(shape) + " is too large");
             space += little(extent, 8);
         }
+        Node& node = new_node(name);
+        const uint64_t address = missing_ == 0 ? undefined_address : place("");
+        node.header = header({{0x01, space},                                                // SPEC IV.A.2.b
+                              {0x03, type},                                                 // IV.A.2.d
+                              {0x05, little(0x01'02'02'02, 4) + little(0, 4)},              // IV.A.2.f: zeros
+                              {0x08, "\3\1" + little(address, 8) + little(missing_, 8)}});  // IV.A.2.i
+    }
+
+    // Finds or makes the groups that the name passes through. Errors: hdf5.name.
+    Node& new_node(const std::string& name) {
         Node* node = &root_;
         for (size_t at = 0; at <= name.size();) {
             const size_t end = std::min(name.find('/', at), name.size());
-            const bool last = end == name.size();
             const std::string part = name.substr(at, end - at);
             Node& child = node->children[part];
-            if (part.empty() || part == "." || !is_utf8(part) || has_control(part) || !child.header.empty() ||
-                (last && !child.children.empty()) || node->children.size() > 65535)
-                fail("hdf5.name", "%s: %s cannot name a data set: a part of it is in use or is no name", path_.c_str(),
-                     json_string(name).c_str());
+            const bool in_use = !child.header.empty() || (end == name.size() && !child.children.empty());
+            const bool no_name = part.empty() || part == "." || !is_utf8(part) || has_control(part);
+            if (in_use || no_name || node->children.size() > 65535)
+                refuse("hdf5.name", "cannot name a data set: a part of it is in use or is no name");
             leaf_k_ = std::max(leaf_k_, (node->children.size() + 1) / 2);
             node = &child;
             at = end + 1;
         }
-        const uint64_t address = missing_ == 0 ? undefined_address : place("");
-        node->header = header({{0x01, space},                                                // SPEC IV.A.2.b
-                               {0x03, type},                                                 // IV.A.2.d
-                               {0x05, little(0x01'02'02'02, 4) + little(0, 4)},              // IV.A.2.f: zeros
-                               {0x08, "\3\1" + little(address, 8) + little(missing_, 8)}});  // IV.A.2.i
+        return *node;
     }
 
     void finish() const {
-        if (missing_ > 0)
-            fail("hdf5.shape", "%s: %s: %zu bytes fewer were given than its shape has", path_.c_str(),
-                 json_string(name_).c_str(), missing_);
+        if (missing_ > 0) refuse("hdf5.shape", std::to_string(missing_) + " bytes fewer were given than its shape has");
     }
 
-    // Writes what the group holds, then itself: SPEC III.D (names), III.B (entries), III.A.1 (a tree of one leaf),
-    // IV.A.2.r. Gives its own entry but for the name (III.C).
+    // Writes what the group holds, then itself: its names, heap, symbol node, a tree of this one node, object header,
+    // as Hdf5Parser::symbol_table draws them. Returns its entry for the group above (SPEC III.C) but for the name.
     std::string group(const Node& node) {
         std::string names(8, '\0'), entries;
         size_t last_name = 0;
@@ -1562,13 +1567,11 @@ class Hdf5Writer {
         return little(address, 8) + little(1, 8) + little(tree, 8) + little(heap, 8);
     }
 
-    std::string path_, temporary_;
-    FileDescriptor file_;
+    AtomicFile file_;
     std::string buffer_;
     uint64_t position_ = 0;  // bytes put
-    bool closed_ = false;
     Node root_;
-    size_t leaf_k_ = 4;        // half the number of entries in a leaf of any group's tree: one leaf must do
+    size_t leaf_k_ = 4;        // half the number of entries in a symbol node of any group: one node must do
     std::string name_, type_;  // of the data set being written
     size_t missing_ = 0;       // bytes
 };

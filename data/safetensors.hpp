@@ -1,20 +1,8 @@
-// safetensors.hpp: bytes to and from disk. Whole files, logs that only grow, and safetensors, which is how models,
-// checkpoints and golden vectors are kept (any version of the `safetensors` Python package opens them).
-//
-//   offset  0                8                                  8 + N                            end of file
-//           +----------------+----------------------------------+--------------------------------+
-//           | N, u64 little- | JSON, then spaces up to a        | data: little-endian, row-major |
-//           | endian, <= 1e8 | multiple of 8 bytes              | every byte belongs to 1 tensor |
-//           +----------------+----------------------------------+--------------------------------+
-//   JSON:   {"__metadata__":{"crc32.header":"89abcdef","crc32.tensors":"0123456789abcdef...","KEY":"TEXT",...},
-//            "NAME":{"dtype":"F32","shape":[2,3],"data_offsets":[BEGIN,END]},...}        offsets count from 8 + N
-//
-// Two metadata entries are ours. crc32.tensors: 8 hex digits for each tensor, in the order of the data. crc32.header:
-// the CRC-32 of bytes 0 to 8 + N, its own eight digits (bytes 41 to 48) taken as 00000000. A file with neither was made
-// elsewhere and is read unchecked; otherwise both must hold, so no single changed bit goes unnoticed.
+// safetensors.hpp: bytes to and from disk. Whole files, logs that only grow, and safetensors, the format of models,
+// checkpoints and golden vectors (any version of the `safetensors` Python package opens them).
 // Promises: equal contents give equal bytes; no input crashes the reader or makes it allocate out of proportion; a
 // write that fails leaves the old file as it was; every error names the file and the tensor or offset. Leaves out:
-// dtypes that nobody here needs, memory mapping, big-endian machines, two processes writing one path.
+// dtypes that nothing here needs, memory mapping, big-endian machines, two processes writing one path.
 #pragma once
 
 #include <fcntl.h>
@@ -57,12 +45,19 @@ struct FileDescriptor {
     }
 };
 
-// Call at once after the failure: it reads errno.
+// Fails with the reason that errno holds, so the caller calls it at once after the failure.
 [[noreturn]] inline void fail_file(const char* id, const char* action, const std::string& path) {
     fail(id, "%s: cannot %s: %s", path.c_str(), action, std::strerror(errno));
 }
 
-// The size in bytes of an open regular file; a folder, pipe or device is refused.
+// Opens a file or fails with `id`. O_NONBLOCK: opening a named pipe must not wait for its other end.
+inline FileDescriptor open_file(const std::string& path, int flags, const char* id, const char* action) {
+    const int fd = ::open(path.c_str(), flags | O_CLOEXEC | O_NONBLOCK, 0666);
+    if (fd < 0) fail_file(id, action, path);
+    return FileDescriptor(fd);
+}
+
+// Returns the size in bytes of an open regular file. Errors: file.not_regular for a folder, pipe or device; file.read.
 inline size_t regular_file_size(const FileDescriptor& file, const std::string& path) {
     struct stat status {};
     if (::fstat(file.fd, &status) != 0) fail_file("file.read", "ask for its size", path);
@@ -71,10 +66,10 @@ inline size_t regular_file_size(const FileDescriptor& file, const std::string& p
     return static_cast<size_t>(status.st_size);
 }
 
-// The whole file. `limit` (bytes) is checked before anything is allocated.
+// Returns the whole file. `limit` (bytes) is checked before anything is allocated. Errors: file.open, file.not_regular,
+// file.too_large, file.read.
 inline std::string read_file(const std::string& path, size_t limit = size_t{1} << 36) {
-    const FileDescriptor file(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));  // a pipe must not block us
-    if (file.fd < 0) fail_file("file.open", "open it", path);
+    const FileDescriptor file = open_file(path, O_RDONLY, "file.open", "open it");
     const size_t size = regular_file_size(file, path);
     if (size > limit) fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), size, limit);
     std::string bytes(size, '\0');
@@ -88,7 +83,7 @@ inline std::string read_file(const std::string& path, size_t limit = size_t{1} <
     return bytes;
 }
 
-// The only place that writes to a disk: POSIX write() may be interrupted and may take less than it was given.
+// This is the only call of write(), which may be interrupted and may take fewer bytes than it was given (POSIX).
 inline void write_all(const FileDescriptor& file, std::string_view bytes, const std::string& path) {
     while (!bytes.empty()) {
         const ssize_t count = ::write(file.fd, bytes.data(), bytes.size());
@@ -102,48 +97,59 @@ inline void sync_to_disk(const FileDescriptor& file, const std::string& path) {
     if (::fsync(file.fd) != 0) fail_file("file.write", "flush it to the disk", path);
 }
 
-// After a rename: without this a power cut may bring the old name back.
+// Makes a rename last: without this call a power cut may bring the old name back.
 inline void sync_folder_of(const std::string& path) {
     const size_t slash = path.find_last_of('/');
     const std::string folder = slash == std::string::npos ? "." : path.substr(0, slash + 1);
-    const FileDescriptor file(::open(folder.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC));
-    if (file.fd < 0) fail_file("file.write", "open the folder to flush it", folder);
+    const FileDescriptor file = open_file(folder, O_RDONLY | O_DIRECTORY, "file.write", "open the folder to flush it");
     // EINVAL: this file system has no such operation.
     if (::fsync(file.fd) != 0 && errno != EINVAL) fail_file("file.write", "flush the folder to the disk", folder);
 }
 
-// The pieces, one after the other, become the file `path`: whoever looks finds the old file or the whole new one.
-// The temporary is PATH.tmp; one left by a killed process is overwritten by the next write.
-inline void write_file_atomic(const std::string& path, std::span<const std::string_view> pieces) {
-    const std::string temporary = path + ".tmp";
-    const FileDescriptor file(::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666));
-    if (file.fd < 0) fail_file("file.write", "create it", temporary);
-    try {
-        for (const std::string_view piece : pieces) write_all(file, piece, temporary);
+// A file that appears as a whole: other programs see the old file or the complete new one. Bytes go to PATH.tmp until
+// commit() renames it; without commit() the temporary is removed. One left by a killed process is overwritten.
+struct AtomicFile {
+    std::string path, temporary;
+    FileDescriptor file;
+    bool renamed = false;
+
+    explicit AtomicFile(const std::string& path_)
+        : path(path_),
+          temporary(path + ".tmp"),
+          file(open_file(temporary, O_WRONLY | O_CREAT | O_TRUNC, "file.write", "create it")) {}
+    ~AtomicFile() {
+        if (!renamed) ::unlink(temporary.c_str());
+    }
+    void write(std::string_view bytes) const { write_all(file, bytes, temporary); }
+    void commit() {
         sync_to_disk(file, temporary);
         if (::rename(temporary.c_str(), path.c_str()) != 0)
             fail_file("file.write", "rename its temporary file to it", path);
-    } catch (const Error&) {
-        ::unlink(temporary.c_str());
-        throw;
+        renamed = true;
+        sync_folder_of(path);  // if only this fails, the new file is already in place
     }
-    sync_folder_of(path);  // if only this fails, the new file is already in place
+};
+
+// Makes the pieces, one after the other, the file `path`, or leaves the old one. Errors: file.write.
+inline void write_file_atomic(const std::string& path, std::span<const std::string_view> pieces) {
+    AtomicFile file(path);
+    for (const std::string_view piece : pieces) file.write(piece);
+    file.commit();
 }
 
 inline void write_file_atomic(const std::string& path, std::string_view bytes) {
     write_file_atomic(path, std::span<const std::string_view>(&bytes, 1));
 }
 
-// A log that grows. Text reaches the system with each append (no buffer of our own), the disk with sync(): note size()
-// in a checkpoint after sync(), and give it to truncate_file before continuing from that checkpoint.
+// A log that grows. append() gives text to the system at once (no buffer), sync() brings it to the disk. A checkpoint
+// notes size() after sync(); a run that continues from the checkpoint gives that size to truncate_file first.
 struct AppendFile {
     std::string path;
     FileDescriptor file;
 
     explicit AppendFile(const std::string& path_)
         : path(path_),
-          file(::open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0666)) {
-        if (file.fd < 0) fail_file("file.open", "open it for writing", path);
+          file(open_file(path, O_WRONLY | O_CREAT | O_APPEND, "file.open", "open it for writing")) {
         regular_file_size(file, path);
     }
     void append(std::string_view text) const { write_all(file, text, path); }
@@ -151,10 +157,9 @@ struct AppendFile {
     size_t size() const { return regular_file_size(file, path); }
 };
 
-// Drops what a log gained after the checkpoint that noted `size` bytes.
+// Drops what a log gained after the checkpoint that noted `size` bytes. Errors: file.open, file.shorter, file.write.
 inline void truncate_file(const std::string& path, size_t size) {
-    const FileDescriptor file(::open(path.c_str(), O_WRONLY | O_CLOEXEC | O_NONBLOCK));
-    if (file.fd < 0) fail_file("file.open", "open it for writing", path);
+    const FileDescriptor file = open_file(path, O_WRONLY, "file.open", "open it for writing");
     const size_t found = regular_file_size(file, path);
     if (found < size)
         fail("file.shorter", "%s: has %zu bytes, the checkpoint was saved when it had %zu; restore it or start anew",
@@ -164,7 +169,7 @@ inline void truncate_file(const std::string& path, size_t size) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// CRC-32 as in zlib and PNG: polynomial 0x04C11DB7, bits reversed, inverted before and after. Finds every single
+// CRC-32 as in zlib and PNG: polynomial 0x04C11DB7, bits reversed, inverted before and after. It finds every single
 // changed bit and every burst of up to 32 bits.
 
 // crc_tables[k][b]: the effect of byte b followed by k zero bytes, so that eight bytes take eight independent look-ups.
@@ -181,16 +186,15 @@ inline constexpr auto crc_tables = [] {
     return tables;
 }();
 
-// crc32(b, crc32(a)) is the checksum of a followed by b.
+// `before` continues a checksum: crc32(b, crc32(a)) is the checksum of a followed by b.
 inline uint32_t crc32(std::string_view bytes, uint32_t before = 0) {
     uint32_t crc = ~before;
     while (bytes.size() >= 8) {
-        uint64_t w;
-        std::memcpy(&w, bytes.data(), 8);
-        w ^= crc;
-        crc = crc_tables[7][w & 255] ^ crc_tables[6][w >> 8 & 255] ^ crc_tables[5][w >> 16 & 255] ^
-              crc_tables[4][w >> 24 & 255] ^ crc_tables[3][w >> 32 & 255] ^ crc_tables[2][w >> 40 & 255] ^
-              crc_tables[1][w >> 48 & 255] ^ crc_tables[0][w >> 56];
+        uint64_t word;
+        std::memcpy(&word, bytes.data(), 8);
+        word ^= crc;
+        crc = 0;
+        for (size_t k = 0; k < 8; ++k) crc ^= crc_tables[7 - k][word >> (8 * k) & 255];
         bytes.remove_prefix(8);
     }
     for (const char byte : bytes) crc = (crc >> 8) ^ crc_tables[0][(crc ^ static_cast<uint8_t>(byte)) & 255];
@@ -201,6 +205,41 @@ inline std::string hex8(uint32_t value) {
     char digits[9];
     std::snprintf(digits, sizeof digits, "%08x", value);
     return digits;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Text
+
+// Control characters must not reach a terminal.
+inline bool is_control(char c) { return (c >= 0 && c < 0x20) || c == 0x7F; }
+inline bool has_control(std::string_view text) { return std::ranges::any_of(text, is_control); }
+
+// Returns `text` as a JSON string with its quotes.
+inline std::string json_string(std::string_view text) {
+    std::string out = "\"";
+    for (const char c : text) {
+        if (c == '"' || c == '\\') out += '\\';
+        out += is_control(c) ? "\\u" + hex8(static_cast<uint32_t>(c)).substr(4) : std::string(1, c);
+    }
+    return out + "\"";
+}
+
+// True for UTF-8 as RFC 3629 defines it: no overlong forms, no surrogates, nothing above U+10FFFF.
+inline bool is_utf8(std::string_view text) {
+    constexpr uint32_t least[] = {0, 0x80, 0x800, 0x10000};  // by the number of bytes that follow the first
+    for (size_t i = 0; i < text.size();) {
+        const auto first = static_cast<uint8_t>(text[i++]);
+        if (first < 0x80) continue;
+        const int more = first >= 0xF0 ? 3 : first >= 0xE0 ? 2 : 1;
+        uint32_t code = first & (0x3Fu >> more);
+        for (int k = 0; k < more; ++k, ++i) {
+            if (i >= text.size() || (text[i] & 0xC0) != 0x80) return false;
+            code = code << 6 | (text[i] & 0x3F);
+        }
+        const bool surrogate = code >> 11 == 0xD800 >> 11;
+        if (first < 0xC0 || first >= 0xF8 || code < least[more] || code > 0x10FFFF || surrogate) return false;
+    }
+    return true;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -228,6 +267,7 @@ consteval DType dtype_of() {
 
 using Shape = std::vector<uint64_t>;  // {} is a scalar: one element
 
+// Returns "[2, 3]"; of more than 16 extents only the first ones.
 inline std::string shape_text(const Shape& shape) {
     std::string text = "[";
     for (const uint64_t extent : std::span(shape).first(std::min<size_t>(shape.size(), 16)))
@@ -235,7 +275,7 @@ inline std::string shape_text(const Shape& shape) {
     return text + (shape.size() > 16 ? ", ... of " + std::to_string(shape.size()) : "") + "]";
 }
 
-// False if the size in bytes does not fit 64 bits.
+// Sets `size` to the bytes of a tensor. Returns false if they do not fit 64 bits.
 inline bool byte_size(size_t& size, const Shape& shape, DType dtype) {
     size = about(dtype).size;
     for (const uint64_t extent : shape)
@@ -243,41 +283,16 @@ inline bool byte_size(size_t& size, const Shape& shape, DType dtype) {
     return true;
 }
 
-// A JSON string with its quotes.
-inline std::string json_string(std::string_view text) {
-    std::string out = "\"";
-    for (const char c : text) {
-        if (c == '"' || c == '\\') out += '\\';
-        const bool control = (c >= 0 && c < 0x20) || c == 0x7F;
-        out += control ? "\\u" + hex8(static_cast<uint32_t>(c)).substr(4) : std::string(1, c);
-    }
-    return out + "\"";
+// Returns the place that a message begins with. A damaged file's name may be of any length.
+inline std::string tensor_place(const std::string& path, const std::string& name) {
+    return path + ": tensor " + json_string(name.substr(0, 80));
 }
 
-// UTF-8 as RFC 3629 has it: no overlong forms, no surrogates, nothing above U+10FFFF.
-inline bool is_utf8(std::string_view text) {
-    constexpr uint32_t least[] = {0, 0x80, 0x800, 0x10000};  // by number of bytes that follow the first
-    for (size_t i = 0; i < text.size();) {
-        const auto first = static_cast<uint8_t>(text[i++]);
-        if (first < 0x80) continue;
-        const int more = first >= 0xF0 ? 3 : first >= 0xE0 ? 2 : 1;
-        uint32_t code = first & (0x3Fu >> more);
-        for (int k = 0; k < more; ++k, ++i) {
-            if (i >= text.size() || (text[i] & 0xC0) != 0x80) return false;
-            code = code << 6 | (text[i] & 0x3F);
-        }
-        const bool surrogate = code >> 11 == 0xD800 >> 11;
-        if (first < 0xC0 || first >= 0xF8 || code < least[more] || code > 0x10FFFF || surrogate) return false;
-    }
-    return true;
-}
-
-// A name can be printed on a terminal as it is.
+// Errors: safetensors.name, so that every name can be printed on a terminal as it is.
 inline void check_name(const std::string& name, const std::string& path) {
-    const auto control = [](char c) { return (c >= 0 && c < 0x20) || c == 0x7F; };
-    if (name == "__metadata__" || std::any_of(name.begin(), name.end(), control))
-        fail("safetensors.name", "%s: %s cannot name a tensor: no control characters, not __metadata__", path.c_str(),
-             json_string(name.substr(0, 80)).c_str());
+    if (name == "__metadata__" || has_control(name))
+        fail("safetensors.name", "%s: cannot have this name: no control characters, not __metadata__",
+             tensor_place(path, name).c_str());
 }
 
 struct StoredTensor {
@@ -287,8 +302,8 @@ struct StoredTensor {
     size_t begin, size;  // bytes; `begin` counts from TensorFile::data_start
 };
 
-// Contents of one file, read or to be written. The tensors cover `buffer` from data_start to its end, in order, without
-// a gap: a file that was read is kept as it came (data_start = 8 + N), a new one has its data alone.
+// The contents of one file, read or to be written. The tensors cover `buffer` from data_start to its end, in order,
+// without a gap: `buffer` is the whole file if it was read (data_start = 8 + N), else the data alone (data_start = 0).
 struct TensorFile {
     std::string path = "(not yet saved)";         // for messages
     std::map<std::string, std::string> metadata;  // sorted, without the two checksum entries
@@ -297,19 +312,20 @@ struct TensorFile {
     std::string buffer;
     size_t data_start = 0;
 
-    std::string_view bytes(const StoredTensor& tensor) const {
-        return std::string_view(buffer).substr(data_start + tensor.begin, tensor.size);
-    }
+    std::string_view data() const { return std::string_view(buffer).substr(data_start); }
+    std::string_view bytes(const StoredTensor& tensor) const { return data().substr(tensor.begin, tensor.size); }
     bool has(const std::string& name) const { return index.contains(name); }
 
+    // Errors: safetensors.missing.
     const StoredTensor& find(const std::string& name) const {
         const auto found = index.find(name);
         if (found == index.end())
-            fail("safetensors.missing", "%s: has no tensor %s among its %zu; is it a file of this kind?", path.c_str(),
-                 json_string(name).c_str(), tensors.size());
+            fail("safetensors.missing", "%s: is not among the %zu tensors; is it a file of this kind?",
+                 tensor_place(path, name).c_str(), tensors.size());
         return tensors[found->second];
     }
 
+    // Returns a metadata entry. Errors: safetensors.missing.
     const std::string& text(const std::string& key) const {
         const auto found = metadata.find(key);
         if (found == metadata.end())
@@ -319,33 +335,34 @@ struct TensorFile {
     }
 
     // Copies `values` (vector, span or array; row-major) to the end. A scalar: add("step", {}, std::array{n}).
+    // Errors: safetensors.name, safetensors.shape, safetensors.duplicate_name.
     template <std::ranges::contiguous_range Values>
     void add(const std::string& name, const Shape& shape, const Values& values) {
-        const std::span data(std::ranges::data(values), std::ranges::size(values));
+        const std::span given(std::ranges::data(values), std::ranges::size(values));
         constexpr DType dtype = dtype_of<std::ranges::range_value_t<Values>>();
         check_name(name, path);
         size_t size = 0;
-        if (!byte_size(size, shape, dtype) || size != data.size_bytes())
-            fail("safetensors.shape", "%s: tensor %s of shape %s was given %zu elements", path.c_str(),
-                 json_string(name).c_str(), shape_text(shape).c_str(), data.size());
+        if (!byte_size(size, shape, dtype) || size != given.size_bytes())
+            fail("safetensors.shape", "%s: has shape %s and was given %zu elements", tensor_place(path, name).c_str(),
+                 shape_text(shape).c_str(), given.size());
         if (!index.emplace(name, tensors.size()).second)
-            fail("safetensors.duplicate_name", "%s: tensor %s was added twice", path.c_str(),
-                 json_string(name).c_str());
-        tensors.push_back({name, dtype, shape, buffer.size() - data_start, size});
-        if (size > 0) buffer.append(reinterpret_cast<const char*>(data.data()), size);
+            fail("safetensors.duplicate_name", "%s: was added twice", tensor_place(path, name).c_str());
+        tensors.push_back({name, dtype, shape, data().size(), size});
+        if (size > 0) buffer.append(reinterpret_cast<const char*>(given.data()), size);
     }
 
-    // Copies tensor `name` to `out`, which must have the stored type, shape and number of elements.
+    // Copies tensor `name` to `out`. Errors: safetensors.missing; safetensors.dtype and safetensors.shape if type, shape
+    // or number of elements are not those stored.
     template <class T>
     void read_into(std::span<T> out, const std::string& name, const Shape& shape) const {
         const StoredTensor& tensor = find(name);
         if (tensor.dtype != dtype_of<T>())
-            fail("safetensors.dtype", "%s: tensor %s has dtype %s, expected %s", path.c_str(),
-                 json_string(name).c_str(), about(tensor.dtype).name, about(dtype_of<T>()).name);
+            fail("safetensors.dtype", "%s has dtype %s, expected %s", tensor_place(path, name).c_str(),
+                 about(tensor.dtype).name, about(dtype_of<T>()).name);
         if (tensor.shape != shape || tensor.size != out.size_bytes())
-            fail("safetensors.shape",
-                 "%s: tensor %s has shape %s, expected %s (%zu elements); made with other settings?", path.c_str(),
-                 json_string(name).c_str(), shape_text(tensor.shape).c_str(), shape_text(shape).c_str(), out.size());
+            fail("safetensors.shape", "%s has shape %s, expected %s (%zu elements); made with other settings?",
+                 tensor_place(path, name).c_str(), shape_text(tensor.shape).c_str(), shape_text(shape).c_str(),
+                 out.size());
         if (!out.empty()) std::memcpy(out.data(), bytes(tensor).data(), tensor.size);  // the file need not be aligned
     }
 
@@ -358,19 +375,32 @@ struct TensorFile {
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Writing
+// The format
+//
+//   offset  0                8                                  8 + N                            end of file
+//           +----------------+----------------------------------+--------------------------------+
+//           | N, u64 little- | JSON in UTF-8, then spaces up to | data: little-endian, row-major |
+//           | endian, <= 1e8 | a multiple of 8 bytes            | every byte belongs to 1 tensor |
+//           +----------------+----------------------------------+--------------------------------+
+//   JSON:   {"__metadata__":{"crc32.header":"89abcdef","crc32.tensors":"0123456789abcdef...","KEY":"TEXT",...},
+//            "NAME":{"dtype":"F32","shape":[2,3],"data_offsets":[BEGIN,END]},...}        offsets count from 8 + N
+//   types:  KEY, TEXT and NAME are strings; extents and offsets are whole numbers below 2^64
+//
+// Two metadata entries are this program's own. crc32.tensors: 8 hex digits for each tensor, in the order of the data.
+// crc32.header: the CRC-32 of bytes 0 to 8 + N, its own eight digits (bytes 41 to 48) taken as 00000000. A file with
+// neither was made elsewhere and is read unchecked; otherwise both must hold, so no single changed bit goes unnoticed.
 
 inline constexpr size_t header_limit = 100'000'000;  // bytes; the same as in the original implementation
 inline constexpr std::string_view header_start = "{\"__metadata__\":{\"crc32.header\":\"";
 inline constexpr size_t crc_at = 8 + header_start.size();  // 41
 
-// CRC-32 of bytes 0 to 8 + N with its own digits taken as zeros.
+// Returns the digits of the CRC-32 of bytes 0 to 8 + N, its own digits taken as zeros.
 inline std::string header_checksum(std::string_view start) {
     const uint32_t before = crc32("00000000", crc32(start.substr(0, crc_at)));
     return hex8(crc32(start.substr(crc_at + 8), before));
 }
 
-// Bytes 0 to 8 + N of the file.
+// Returns bytes 0 to 8 + N of the file. Errors: safetensors.metadata.
 inline std::string file_start(const TensorFile& file) {
     std::string out = std::string(8, '\0') + std::string(header_start) + "00000000\",\"crc32.tensors\":\"";
     for (const StoredTensor& tensor : file.tensors) out += hex8(crc32(file.bytes(tensor)));
@@ -380,8 +410,8 @@ inline std::string file_start(const TensorFile& file) {
     for (const StoredTensor& tensor : file.tensors) {
         out += "," + json_string(tensor.name) + ":{\"dtype\":\"" + about(tensor.dtype).name + "\",\"shape\":[";
         for (size_t i = 0; i < tensor.shape.size(); ++i) out += (i > 0 ? "," : "") + std::to_string(tensor.shape[i]);
-        out += "],\"data_offsets\":[" + std::to_string(tensor.begin) + "," +
-               std::to_string(tensor.begin + tensor.size) + "]}";
+        const size_t end = tensor.begin + tensor.size;
+        out += "],\"data_offsets\":[" + std::to_string(tensor.begin) + "," + std::to_string(end) + "]}";
     }
     out += "}";
     out.resize((out.size() + 7) / 8 * 8, ' ');
@@ -395,19 +425,14 @@ inline std::string file_start(const TensorFile& file) {
     return out;
 }
 
-inline std::string serialise_safetensors(const TensorFile& file) {
-    return file_start(file) + file.buffer.substr(file.data_start);
-}
-
-// As above, straight to the disk: several hundred megabytes are not copied once more.
+// Writes the file in two pieces: several hundred megabytes of data are not copied once more.
 inline void write_safetensors(const std::string& path, const TensorFile& file) {
     const std::string start = file_start(file);
-    write_file_atomic(path, std::array{std::string_view(start), std::string_view(file.buffer).substr(file.data_start)});
+    write_file_atomic(path, std::array{std::string_view(start), file.data()});
 }
 
-// ---------------------------------------------------------------------------------------------------------------------
-// Reading. Nothing here recurses: a header is objects two deep, written out as such, and anything else is refused.
-
+// Reads the JSON. Nothing here recurses: a header is objects two deep, read by nested calls, and anything else is
+// refused (safetensors.json).
 struct HeaderReader {
     std::string_view file;  // bytes 0 to 8 + N
     const std::string& path;
@@ -417,9 +442,7 @@ struct HeaderReader {
         fail("safetensors.json", "%s: offset %zu: expected %s; the file is damaged or is not safetensors", path.c_str(),
              at, what);
     }
-    void skip_space() {
-        while (at < file.size() && std::string_view(" \t\r\n").find(file[at]) != std::string_view::npos) ++at;
-    }
+    void skip_space() { at = std::min(file.find_first_not_of(" \t\r\n", at), file.size()); }
     bool take(char c) {
         skip_space();
         const bool found = at < file.size() && file[at] == c;
@@ -430,7 +453,7 @@ struct HeaderReader {
         if (!take(c)) expected(std::string(1, c).c_str());
     }
 
-    // \uXXXX as UTF-8. Surrogate pairs are refused: whoever writes characters above U+FFFF writes them as UTF-8.
+    // Returns \uXXXX as UTF-8. Surrogate pairs are refused: other programs write characters above U+FFFF as UTF-8.
     std::string unicode_escape() {
         uint32_t code = 0;
         const std::string_view digits = file.substr(at, 4);
@@ -478,7 +501,7 @@ struct HeaderReader {
         need(']');
         return out;
     }
-    // Calls member(key) with the reader at each value; it returns false if the key came before.
+    // Calls member(key) with the reader at each value; member returns false if the key came before.
     template <class Member>
     void object(const Member& member) {
         need('{');
@@ -494,52 +517,53 @@ struct HeaderReader {
     }
 };
 
-inline DType dtype_named(const std::string& dtype, const std::string& tensor, const std::string& path) {
+inline DType dtype_named(const std::string& dtype, const std::string& place) {
     for (size_t i = 0; i < std::size(dtypes); ++i)
         if (dtype == dtypes[i].name) return static_cast<DType>(i);
-    fail("safetensors.dtype", "%s: tensor %s has dtype %s, known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first",
-         path.c_str(), json_string(tensor).c_str(), json_string(dtype.substr(0, 80)).c_str());
+    fail("safetensors.dtype", "%s has dtype %s, known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first",
+         place.c_str(), json_string(dtype.substr(0, 80)).c_str());
 }
 
-// {"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}
+// Reads {"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}. std::exchange() returns what the field held before, so a
+// field that comes twice is refused.
 inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
     check_name(name, reader.path);
+    const std::string place = tensor_place(reader.path, name);
     std::optional<DType> dtype;
     std::optional<Shape> shape, offsets;
     reader.object([&](const std::string& field) {
-        if (field == "dtype") return !std::exchange(dtype, dtype_named(reader.string(), name, reader.path));
+        if (field == "dtype") return !std::exchange(dtype, dtype_named(reader.string(), place));
         if (field == "shape") return !std::exchange(shape, reader.integers());
         if (field == "data_offsets") return !std::exchange(offsets, reader.integers());
         reader.expected("dtype, shape or data_offsets");
     });
     if (!dtype || !shape || !offsets || offsets->size() != 2)
         reader.expected("dtype, shape and two data_offsets before this");
-    const std::string where = reader.path + ": tensor " + json_string(name);
     const size_t begin = offsets->front(), end = offsets->back();
     if (begin > end)
-        fail("safetensors.offsets", "%s: data_offsets %zu, %zu end before they begin", where.c_str(), begin, end);
+        fail("safetensors.offsets", "%s: data_offsets %zu, %zu end before they begin", place.c_str(), begin, end);
     size_t size = 0;
     if (!byte_size(size, *shape, *dtype) || size != end - begin)
-        fail("safetensors.shape", "%s: shape %s of %s does not fill data_offsets %zu, %zu", where.c_str(),
+        fail("safetensors.shape", "%s: shape %s of %s does not fill data_offsets %zu, %zu", place.c_str(),
              shape_text(*shape).c_str(), about(*dtype).name, begin, end);
     return {name, *dtype, *shape, begin, size};
 }
 
-// No holes, no overlaps, nothing left over. Sorts by place: others' headers may list tensors in any order.
+// Refuses holes, overlaps and a rest. Sorts the tensors by place: a header of another program may have any order.
 inline void check_layout(TensorFile& file) {
     std::stable_sort(file.tensors.begin(), file.tensors.end(), [](const StoredTensor& a, const StoredTensor& b) {
         return std::pair(a.begin, a.size) < std::pair(b.begin, b.size);  // an empty tensor before the one that follows
     });
-    const size_t available = file.buffer.size() - file.data_start;
+    const size_t available = file.data().size();
     size_t next = 0;
     for (const StoredTensor& tensor : file.tensors) {
-        const std::string where = file.path + ": tensor " + json_string(tensor.name);
+        const std::string place = tensor_place(file.path, tensor.name);
         if (tensor.begin != next)
-            fail("safetensors.offsets", "%s: begins at data offset %zu, expected %zu: %s", where.c_str(), tensor.begin,
+            fail("safetensors.offsets", "%s: begins at data offset %zu, expected %zu: %s", place.c_str(), tensor.begin,
                  next, tensor.begin < next ? "tensors overlap" : "there is a hole");
         if (tensor.size > available - next)
             fail("safetensors.truncated", "%s at byte %zu: needs %zu bytes of data, %zu are left; the file was cut off",
-                 where.c_str(), file.data_start + next, tensor.size, available - next);
+                 place.c_str(), file.data_start + next, tensor.size, available - next);
         next += tensor.size;
     }
     if (next != available)
@@ -547,7 +571,7 @@ inline void check_layout(TensorFile& file) {
              available - next);
 }
 
-// Checks and removes our two metadata entries.
+// Checks and removes this program's two metadata entries. Errors: safetensors.checksum.
 inline void check_checksums(TensorFile& file) {
     const auto stored = file.metadata.extract("crc32.header"), tensors = file.metadata.extract("crc32.tensors");
     if (!stored && !tensors) return;
@@ -556,19 +580,20 @@ inline void check_checksums(TensorFile& file) {
                           tensors.mapped().size() == 8 * file.tensors.size();
     if (!complete || start.substr(crc_at, 8) != header_checksum(start))
         fail("safetensors.checksum",
-             "%s: the header does not match its checksum; the file is damaged (a program that rewrites our files must "
+             "%s: the header does not match its checksum; the file is damaged (a program that rewrites it must "
              "drop the metadata entries crc32.header and crc32.tensors)",
              file.path.c_str());
     for (size_t i = 0; i < file.tensors.size(); ++i) {
         const std::string found = hex8(crc32(file.bytes(file.tensors[i])));
         const std::string expected = tensors.mapped().substr(8 * i, 8);
         if (found != expected)
-            fail("safetensors.checksum",
-                 "%s: tensor %s has CRC-32 %s, expected %s; the file is damaged, use another copy", file.path.c_str(),
-                 json_string(file.tensors[i].name).c_str(), found.c_str(), expected.c_str());
+            fail("safetensors.checksum", "%s has CRC-32 %s, expected %s; the file is damaged, use another copy",
+                 tensor_place(file.path, file.tensors[i].name).c_str(), found.c_str(), expected.c_str());
     }
 }
 
+// Reads a file's bytes; `path` is for messages. Errors: safetensors.truncated, .header_length, .json, .name,
+// .duplicate_name, .dtype, .shape, .offsets, .trailing, .checksum.
 inline TensorFile parse_safetensors(std::string bytes, const std::string& path) {
     TensorFile file;
     file.path = path;
@@ -601,7 +626,7 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
 
     check_layout(file);
     check_checksums(file);
-    file.index.clear();  // it knew names only, no places
+    file.index.clear();  // the places are known only after the sort
     for (size_t i = 0; i < file.tensors.size(); ++i) file.index.emplace(file.tensors[i].name, i);
     return file;
 }
@@ -609,27 +634,30 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
 inline TensorFile read_safetensors(const std::string& path) { return parse_safetensors(read_file(path), path); }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Archives, for state that lists its fields once: visit(archive) calls archive(name, field) for each of them.
+// Archives, for state that lists its fields once: visit(archive) calls archive(name, field) for each of them, or
+// archive(name, vector, size) where the program knows how long the vector must be.
 
 struct Saver {
     static constexpr bool loading = false;
     TensorFile& file;
     template <class T>
-    void operator()(const std::string& name, const std::vector<T>& values) {
-        file.add(name, {values.size()}, values);
+    void operator()(const std::string& name, const std::vector<T>& values, std::optional<size_t> size = {}) {
+        file.add(name, {size.value_or(values.size())}, values);
     }
     template <class T>
     requires std::is_arithmetic_v<T>
     void operator()(const std::string& name, T value) { file.add(name, {}, std::array{value}); }
 };
 
-// A vector that is empty takes whatever size is there, another keeps its own.
+// Errors: those of TensorFile::read_into.
 struct Loader {
     static constexpr bool loading = true;
     const TensorFile& file;
+    // Without `size` a vector that is empty takes the stored size, and another keeps its own.
     template <class T>
-    void operator()(const std::string& name, std::vector<T>& values) {
-        if (values.empty()) values.resize(file.find(name).size / sizeof(T));
+    void operator()(const std::string& name, std::vector<T>& values, std::optional<size_t> size = {}) {
+        const size_t stored = file.find(name).size / sizeof(T);
+        values.resize(size.value_or(values.empty() ? stored : values.size()));
         file.read_into(std::span<T>(values), name, {values.size()});
     }
     template <class T>

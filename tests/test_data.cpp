@@ -46,6 +46,8 @@ TensorFile small_file() {
 
 TensorFile parse(const std::string& bytes) { return parse_safetensors(bytes, "test"); }
 
+std::string serialise_safetensors(const TensorFile& file) { return file_start(file) + std::string(file.data()); }
+
 }  // namespace
 
 TEST(crc32_gives_the_published_check_value) {
@@ -109,6 +111,39 @@ TEST(safetensors_get_names_what_is_wrong) {
         CHECK_EQUAL(std::string(error.what()),
                     "test: tensor \"weight\" has shape [2, 3], expected [6] (6 elements); made with other settings?");
     }
+}
+
+TEST(archives_give_back_what_they_took_and_demand_the_size_that_they_are_given) {
+    TensorFile file;
+    Saver saver{file};
+    const std::vector<float> mean = {1, 2, 3};
+    saver("free", mean);
+    saver("mean", mean, 3);
+    saver("none", std::vector<float>{}, 0);
+    saver("step", uint64_t{7});
+    CHECK_FAILS("safetensors.shape", saver("other", mean, 4));
+    const TensorFile again = parse(serialise_safetensors(file));
+    Loader loader{again};
+    std::vector<float> empty, kept(3), shorter(2);
+    loader("free", empty);
+    CHECK(empty == mean);
+    loader("free", kept);
+    CHECK(kept == mean);
+    CHECK_FAILS("safetensors.shape", loader("free", shorter));
+    uint64_t step = 0;
+    loader("step", step);
+    CHECK_EQUAL(step, uint64_t{7});
+    for (std::vector<float> values : {std::vector<float>{}, std::vector<float>(3), std::vector<float>(9)}) {
+        loader("mean", values, 3);  // the given size decides, not that of the vector
+        CHECK(values == mean);
+        loader("none", values, 0);
+        CHECK(values.empty());
+        for (const size_t size : {0, 2, 4}) CHECK_FAILS("safetensors.shape", loader("mean", values, size));
+        CHECK_FAILS("safetensors.shape", loader("none", values, 1));
+    }
+    std::vector<double> doubles;
+    CHECK_FAILS("safetensors.dtype", loader("mean", doubles, 3));
+    CHECK_FAILS("safetensors.missing", loader("deviation", empty, 3));
 }
 
 TEST(safetensors_refuses_what_it_could_not_read_back) {

@@ -81,6 +81,8 @@ Checked check_bytes(const std::string& bytes, bool verbose = false) {
     if (problem) std::rethrow_exception(problem);
     return checked;
 }
+std::string serialise_safetensors(const TensorFile& file) { return file_start(file) + std::string(file.data()); }
+
 Checked check(const TensorFile& file) { return check_bytes(serialise_safetensors(file)); }
 
 // A file written by hand, as someone else might.
