@@ -241,7 +241,7 @@ inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& whi
 }
 
 // D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last
-// one allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: collection stopped there.
+// one allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: the collection stopped.
 //   No timeouts in the file (the first versions): `limit` steps end a trajectory too.
 //   Gym sets of replay buffers: timeouts also mark the ends of collection blocks; they cut, as in D4RL.
 //   maze2d: terminals are all 0, and timeouts mark that a navigation goal was reached; the body is not reset, and the

@@ -49,23 +49,16 @@ inline void sha256_block(std::array<uint32_t, 8>& hash, const uint8_t* block) {
         const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
         w[t] = (std::rotr(y, 17) ^ std::rotr(y, 19) ^ y >> 10) + w[t - 7] + s0 + w[t - 16];
     }
-    auto [a, b, c, d, e, f, g, h] = hash;
+    std::array<uint32_t, 8> v = hash;
     for (size_t t = 0; t < 64; ++t) {
+        const auto [a, b, c, d, e, f, g, h] = v;
         const uint32_t s1 = std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25);
         const uint32_t s0 = std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22);
         const uint32_t t1 = h + s1 + ((e & f) ^ (~e & g)) + constants[t] + w[t];
         const uint32_t t2 = s0 + ((a & b) ^ (a & c) ^ (b & c));
-        h = g;
-        g = f;
-        f = e;
-        e = d + t1;
-        d = c;
-        c = b;
-        b = a;
-        a = t1 + t2;
+        v = {t1 + t2, a, b, c, d + t1, e, f, g};
     }
-    const uint32_t added[8] = {a, b, c, d, e, f, g, h};
-    for (size_t i = 0; i < 8; ++i) hash[i] += added[i];
+    for (size_t i = 0; i < 8; ++i) hash[i] += v[i];
 }
 
 // Returns the SHA-256 of a message as 64 hexadecimal digits.
@@ -665,16 +658,13 @@ struct Hdf5Parser {
         c.start = 0;
         const uint64_t version = c.number(1);
         c.expect(version <= 3, "a superblock of version 0 to 3");
-        if (version < 2) c.take(4);
-        c.expect(c.number(1) == 8 && c.number(1) == 8, "offsets and lengths of 8 bytes", "hdf5.unsupported");
-        c.take(version == 0 ? 9 : version == 1 ? 13 : 1);
-        c.take(16);
-        const uint64_t end = c.number(8);
+        const auto [versions, offsets, lengths] = c.fields(version < 2 ? 4 : 0, 1, 1);
+        c.expect(offsets == 8 && lengths == 8, "offsets and lengths of 8 bytes", "hdf5.unsupported");
+        const int before = version == 0 ? 9 : version == 1 ? 13 : 1;  // bytes up to the base address
+        const auto [flags, base_address, more, end, driver, root] = c.fields(before, 8, 8, 8, version < 2 ? 16 : 0, 8);
         if (end > all.size())
             fail("hdf5.truncated", "%s: has %zu bytes, its superblock says %zu; the file was cut off",
-                 file.path.c_str(), all.size(), static_cast<size_t>(end));
-        if (version < 2) c.take(16);
-        const uint64_t root = c.number(8);
+                 file.path.c_str(), all.size(), size_t{end});
         if (version >= 2) c.checksum();
         link("", root, 0);
         std::ranges::sort(file.datasets, {}, &Hdf5Dataset::path);
@@ -838,8 +828,7 @@ struct Hdf5Parser {
         Tree2 tree{type, record_size};
         uint64_t below = 0;  // the most records in a subtree
         for (uint64_t level = 0; level <= depth; ++level) {
-            uint64_t pointer = 0;
-            if (level > 0) pointer = 8 + Tree2::width(tree.most[0]) + tree.subtree_width.back();
+            const uint64_t pointer = level == 0 ? 0 : 8 + Tree2::width(tree.most[0]) + tree.subtree_width.back();
             c.expect(node_size >= 10 + pointer, "room for a pointer in a node");
             tree.most.push_back((node_size - 10 - pointer) / (record_size + pointer));
             below = product(tree.most.back() + 1, below, address) + tree.most.back();
@@ -889,13 +878,9 @@ struct Hdf5Parser {
         const bool powers = std::has_single_bit(width) && std::has_single_bit(smallest) && std::has_single_bit(largest);
         c.expect(powers && smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && most > 0 && rows <= 64,
                  "a doubling table of powers of two");
-        Heap heap{.address = address,
-                  .width = width,
-                  .smallest = smallest,
-                  .direct_rows = log2(largest) - log2(smallest) + 2,
-                  .offset_width = (bits + 7) / 8,
-                  .length_width = log2(std::min(most, largest)) / 8 + 1,
-                  .checked = (flags & 2) != 0};
+        const uint64_t direct_rows = log2(largest) - log2(smallest) + 2;
+        const uint64_t length_width = log2(std::min(most, largest)) / 8 + 1;
+        Heap heap{address, width, smallest, direct_rows, (bits + 7) / 8, length_width, (flags & 2) != 0};
         if (root != undefined_address && rows == 0) direct_block(heap, root, smallest, 0);
         if (root != undefined_address && rows > 0) indirect_block(heap, root, rows, 0);
         return heap;
@@ -1127,10 +1112,8 @@ struct Hdf5Parser {
         g.d.filters.clear();
         g.d.chunk = g.d.shape;
         g.d.chunk_bytes = total;
-        uint64_t address = undefined_address, size = 0;
-        if (!compact) address = c.number(8);
-        size = c.number(compact ? 2 : 8);
-        if (compact) address = c.at;
+        const auto [elsewhere, size] = compact ? c.fields(0, 2) : c.fields(8, 8);
+        const uint64_t address = compact ? c.at : elsewhere;
         if (total == 0 || address == undefined_address) return;
         c.expect(size >= total, std::to_string(total) + " bytes of data");
         add(g, {}, {address, total, 0, 0}, c.start);

@@ -351,8 +351,8 @@ struct TensorFile {
         if (size > 0) buffer.append(reinterpret_cast<const char*>(given.data()), size);
     }
 
-    // Copies tensor `name` to `out`. Errors: safetensors.missing; safetensors.dtype and safetensors.shape if type, shape
-    // or number of elements are not those stored.
+    // Copies tensor `name` to `out`. Errors: safetensors.missing; safetensors.dtype and safetensors.shape if the type,
+    // the shape or the number of elements is not the stored one.
     template <class T>
     void read_into(std::span<T> out, const std::string& name, const Shape& shape) const {
         const StoredTensor& tensor = find(name);
