@@ -210,7 +210,7 @@ inline constexpr auto distance_ranges = number_ranges<30>(1, 2);
 struct BitReader {
     const uint8_t *in, *in_end;
     uint64_t bits = 0;  // read, not yet taken
-    int count = 0;      // of them; below 0: the input ended, and zeros were taken for it
+    int count = 0;      // number of these bits; below 0: the input ended, and zeros were taken for it
 
     // Makes at least 57 bits ready, as long as there is input.
     void refill() {
@@ -327,7 +327,10 @@ struct Inflater {
             if (type == 3) bad_stream("a block of type 3");
             if (type == 1) fixed_codes();
             if (type == 2) read_codes();
-            type == 0 ? stored() : compressed();
+            if (type == 0)
+                stored();
+            else
+                compressed();
         }
         if (source.count < 0) bad_stream("the end of the compressed data");
         source.in -= source.count / 8;
@@ -632,13 +635,10 @@ struct Hdf5Parser {
             return next;
         }
     };
-    Cursor cursor(uint64_t address) {
-        require_inside(address, 0);
-        return {*this, address, file.bytes.size()};
-    }
-    Cursor cursor(uint64_t address, uint64_t size) {
-        require_inside(address, size);
-        return {*this, address, address + size};
+    // Without `size` the end is that of the file.
+    Cursor cursor(uint64_t address, std::optional<uint64_t> size = {}) {
+        require_inside(address, size.value_or(0));
+        return {*this, address, size ? address + *size : file.bytes.size()};
     }
 
     // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...; a user block may come before it.

@@ -39,6 +39,50 @@ std::string shown(const std::vector<Trajectory>& trajectories) {
 
 }  // namespace
 
+TEST(episodes_of_minari_become_rows_and_each_ends_a_trajectory) {
+    char name[] = "/tmp/wodtem-test-XXXXXX";
+    const std::string folder = mkdtemp(name), path = folder + "/minari";  // known by its signature
+    const auto write = [&](uint64_t columns, uint64_t steps) {
+        Hdf5Writer out(path);
+        const std::vector<double> numbers = {1, 2, 3, 4, 5, 6, 7, 8, 9};
+        const auto first = [](const auto& values, uint64_t n) { return std::span(values).first(n); };
+        for (const auto& [group, S, T] :
+             {std::tuple("episode_0/", uint64_t{2}, uint64_t{2}), {"episode_1/", columns, steps}}) {
+            out.add(group + std::string("observations"), {T + 1, S}, first(numbers, (T + 1) * S));
+            out.add(group + std::string("actions"), {T, 1}, first(numbers, T));
+            out.add(group + std::string("rewards"), {T}, first(numbers, T));
+            out.add(group + std::string("terminations"), {T}, first(std::array<uint8_t, 2>{0, 0}, T));
+            out.add(group + std::string("truncations"), {T}, first(std::array<uint8_t, 2>{0, 0}, T));
+        }
+        out.close();
+    };
+    write(2, 1);
+    CHECK(is_hdf5(path));
+    const Rows rows = read_data_set(path);
+    CHECK_EQUAL(rows.count, size_t{3});
+    CHECK_EQUAL(rows.state_dim, size_t{2});
+    CHECK(rows.observations == (std::vector<float>{1, 2, 3, 4, 1, 2}));
+    CHECK(rows.next_observations == (std::vector<float>{3, 4, 5, 6, 3, 4}));
+    CHECK(rows.actions == (std::vector<float>{1, 2, 1}));
+    CHECK_EQUAL(cut_at_flags(rows, 1000).size(), size_t{2});
+    for (const auto& [columns, steps] : {std::pair(1, 2), {3, 1}, {0, 1}, {2, 0}}) {
+        write(static_cast<uint64_t>(columns), static_cast<uint64_t>(steps));
+        CHECK_FAILS("dataset.shape", read_data_set(path));
+    }
+    {
+        Hdf5Writer out(path);
+        out.add("observations", {2, 1, 1}, std::array{1.0f, 2.0f});
+        out.close();
+    }
+    CHECK_FAILS("dataset.shape", read_data_set(path));
+    const std::string whole = read_file(path);
+    write_file_atomic(path, std::string(1024, ' ') + whole);  // a user block
+    CHECK(is_hdf5(path));
+    write_file_atomic(path, std::string(1000, ' ') + whole);
+    CHECK(!is_hdf5(path) && is_hdf5(path + ".h5"));
+    std::filesystem::remove_all(folder);
+}
+
 TEST(trajectories_end_at_terminals_and_timeouts_and_a_tail_without_a_flag_is_none) {
     const Rows rows = made({5, 6, 7, 8, 9, 1, 2, 3}, {0, 0, 1, 0, 0, 0, 0, 0}, {0, 0, 0, 0, 0, 1, 0, 0});
     CHECK_EQUAL(shown(cut_at_flags(rows, 1000)), "0 1 2! | 3 4 5");
