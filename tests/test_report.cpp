@@ -90,7 +90,9 @@ std::string write_mujoco_run(const std::string& parent, const std::string& task,
 
 Run run_with(const std::vector<double>& interactions, const std::vector<double>& length, bool finished) {
     Run run;
-    run.interactions = interactions, run.length = length, run.finished = finished;
+    run.interactions = interactions;
+    run.length = length;
+    run.finished = finished;
     run.so_far = interactions.back();
     return run;
 }
@@ -147,7 +149,7 @@ TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
 
 TEST(resampling_takes_the_last_evaluation_at_or_before_each_point) {
     const Run run = run_with({0, 240, 250, 600, 760, 1010}, {50, 40, 30, 20, none, 10}, true);
-    CHECK(equal(curve_points({&run}), {0, 250, 500, 750, 1000}));
+    CHECK(equal(curve_points({Runs{&run}}), {0, 250, 500, 750, 1000}));
     // 760 has no value; 1010 is the final one and shows at the last point
     CHECK(equal(resampled(run, &Run::length, {0, 249, 250, 500, 750, 900, 1000}), {50, 40, 30, 30, 20, 20, 10}));
 }
@@ -157,7 +159,8 @@ TEST(unfinished_run_ends_where_it_stands_and_finished_one_keeps_its_last_value) 
     CHECK(equal(resampled(open, &Run::length, {0, 250, 260, 500}), {9, 9, 8, none}));
     CHECK(equal(resampled(done, &Run::length, {0, 250, 260, 500}), {9, 9, 8, 8}));
     std::vector<double> mean, deviation;
-    fill_spread(mean, deviation, std::vector<std::vector<double>>{{4, 6}, {8, none}});
+    const Run a = run_with({0, 1}, {4, 6}, true), b = run_with({0, 1}, {8, none}, true);
+    append_spread(mean, deviation, {&a, &b}, [](const Run& run) { return run.length; });
     CHECK(equal(mean, {6, 6}) && equal(deviation, {std::sqrt(8.0), none}));
 }
 
