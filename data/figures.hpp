@@ -805,6 +805,7 @@ struct Section {
     std::vector<std::string> paragraphs;
     std::vector<Table> tables;
     std::vector<Figure> figures;
+    std::string verdict = "";  // one sentence for the top of the page, or empty
 };
 
 // A vertical bar would end a field.
@@ -837,9 +838,11 @@ inline std::string html_table(const Table& table) {
     return out + "</tbody></table></div>\n";
 }
 
-// The title, then the sections; figures are links to their files.
+// The title, all verdicts, then the sections; figures are links to their files.
 inline std::string markdown_page(const std::string& title, const std::vector<Section>& sections) {
     std::string out = "# " + title + "\n";
+    for (const Section& section : sections)
+        if (!section.verdict.empty()) out += "\n" + section.verdict + "\n";
     for (const Section& section : sections) {
         out += "\n## " + section.heading + "\n";
         for (const std::string& paragraph : section.paragraphs) out += "\n" + paragraph + "\n";
@@ -867,6 +870,8 @@ inline std::string html_page(const std::string& title, const std::vector<Section
         "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n" +
         tagged("title", title) + "\n<style>\n" + style_sheet + "</style>\n</head>\n<body>\n" + tagged("h1", title) +
         "\n";
+    for (const Section& section : sections)
+        if (!section.verdict.empty()) out += tagged("p", section.verdict) + "\n";
     for (const Section& section : sections) {
         out += tagged("h2", section.heading) + "\n";
         for (const std::string& paragraph : section.paragraphs) out += tagged("p", paragraph) + "\n";

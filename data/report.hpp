@@ -1,6 +1,6 @@
 // report.hpp: run folders in, tables and figures out: report.html (one file that needs nothing else), its figures as
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
-// length, and mazes the paths through them.
+// length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
 //
 // Reads from each folder:  settings            lines `name = value    # source`; task, method, preset, seed are needed
 //                          progress.csv        one row per evaluation, the first at the end of the offline phase
@@ -12,7 +12,7 @@
 // Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; seeds are
 // averaged only if nothing but the seed was set differently, and the physics were the same; errors name file and line.
 // Leaves out: networks, statistics beyond mean and standard deviation, judging whether a difference matters.
-// Order: settings; one run folder; numbers; words; figures; tables; the report.
+// Order: settings; one run folder; numbers; words; the paper's results; figures; tables; the report.
 #pragma once
 
 #include <array>
@@ -76,14 +76,15 @@ struct Method {
     const char* label;
     Colour colour;
     const char* paper_length;  // the grid world's final length in the paper, as text
+    double shortest, longest;  // lengths that agree with that text; NaN: the paper gives no number
     const char* start_figure;  // the paper's figure of the actions at S
 };
 constexpr double none = std::numeric_limits<double>::quiet_NaN();
 constexpr std::array<const char*, 3> method_names{"dt", "odt", "wodtem"};
 constexpr std::array<Method, 3> methods{{
-    {"DT", Colour::green, "no number (fig. 4a)", ""},
-    {"ODT", Colour::blue, "about 7 (sec. IV-A)", "1d"},
-    {"WODTEM", Colour::vermillion, "5 (sec. V-D)", "4b"},
+    {"DT", Colour::green, "no number (fig. 4a)", none, none, ""},
+    {"ODT", Colour::blue, "about 7 (sec. IV-A)", 6.5, 7.5, "1d"},
+    {"WODTEM", Colour::vermillion, "5 (sec. V-D)", 5, 5, "4b"},
 }};
 
 // One number in [0, 1] for each move, in the order of grid_move_table.
@@ -545,6 +546,89 @@ inline std::string other_options(const Run& run) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// The paper's results, and one sentence that compares a task's runs with them
+
+struct PaperScore {
+    double mean, deviation;
+};
+// One row of Table III.
+struct PaperScores {
+    const char* task;  // without the version
+    std::array<PaperScore, 3> by_method;
+};
+// WODTEM Table III: normalised scores after 200,000 online interactions, over five seeds; DT, ODT, WODTEM.
+constexpr std::array<PaperScores, 13> paper_scores{{
+    {"hopper-medium", {{{61.03, 5.11}, {95.56, 3.53}, {96.54, 4.60}}}},
+    {"hopper-medium-replay", {{{62.75, 15.05}, {85.52, 3.26}, {88.78, 2.16}}}},
+    {"walker2d-medium", {{{72.03, 4.32}, {72.58, 1.42}, {73.99, 2.26}}}},
+    {"walker2d-medium-replay", {{{42.53, 15.36}, {73.11, 4.54}, {76.26, 3.97}}}},
+    {"halfcheetah-medium", {{{42.43, 0.30}, {42.38, 0.25}, {42.17, 0.11}}}},
+    {"halfcheetah-medium-replay", {{{35.92, 1.56}, {40.08, 0.46}, {40.09, 0.51}}}},
+    {"ant-medium", {{{93.56, 4.94}, {87.51, 2.69}, {88.96, 2.45}}}},
+    {"ant-medium-replay", {{{89.08, 5.33}, {88.92, 1.10}, {91.31, 2.25}}}},
+    {"antmaze-umaze", {{{53.30, 5.52}, {82.60, 5.57}, {80.20, 1.33}}}},
+    {"antmaze-umaze-diverse", {{{52.50, 9.89}, {53.60, 1.47}, {58.60, 3.72}}}},
+    {"maze2d-umaze", {{{39.95, 12.17}, {31.85, 7.46}, {75.18, 10.79}}}},
+    {"maze2d-medium", {{{19.11, 4.17}, {82.88, 7.88}, {96.23, 3.24}}}},
+    {"maze2d-large", {{{38.93, 4.32}, {69.23, 12.35}, {84.26, 16.54}}}},
+}};
+
+// "5.00", or with several seeds "53.50 ± 65.76".
+inline std::string short_text(const Spread& spread) {
+    return spread.count > 1 ? plus_minus(spread) : shown(spread.mean, 2);
+}
+
+// "takes 100.00 steps (return 0.00), never reaching the goal, which does not agree with the paper: about 7, ..."
+inline std::string compare_grid_world(const Runs& runs) {
+    const Method& method = runs[0]->about_method();
+    const Spread length = spread_of(runs, final_value, &Run::length);
+    const Spread total = spread_of(runs, final_value, &Run::total);
+    std::string out = "takes " + short_text(length) + " steps (return " + short_text(total) + ")";
+    if (total.mean == 0) out += ", never reaching the goal";
+    if (length.mean == 5) out += ", the shortest path";
+    if (std::isnan(method.shortest)) return out + "; the paper gives " + method.paper_length;
+    const bool agrees = length.mean >= method.shortest && length.mean <= method.longest && total.mean == 1;
+    return out + (agrees ? ", which agrees" : ", which does not agree") + " with the paper: " + method.paper_length +
+           ", return 1";
+}
+
+// "scores 17.35, below the paper's 75.18 ± 10.79"; "within" means by at most the paper's standard deviation.
+inline std::string compare_scores(const Runs& runs, const PaperScore& paper) {
+    const Spread score = spread_of(runs, final_value, &Run::score);
+    const double difference = score.mean - paper.mean;
+    const char* relation = std::fabs(difference) <= paper.deviation ? "within" : difference < 0 ? "below" : "above";
+    return "scores " + short_text(score) + ", " + relation + " the paper's " + shown(paper.mean, 2) + " ± " +
+           shown(paper.deviation, 2);
+}
+
+// Compares each method with the paper in one sentence, WODTEM first; "" where the paper has no result. The sentence
+// ends with what else differs from the paper's experiment: the number of interactions, and the data set.
+inline std::string compare_with_paper(const std::string& heading, const std::vector<Runs>& by_method) {
+    const Run& any = *by_method.at(0)[0];
+    const bool gridworld = any.task == "gridworld";
+    const auto paper = std::find_if(paper_scores.begin(), paper_scores.end(), [&](const PaperScores& row) {
+        return any.task.starts_with(std::string(row.task) + "-v");
+    });
+    if (!gridworld && paper == paper_scores.end()) return "";
+    std::string out, interactions;
+    for (size_t i = by_method.size(); i-- > 0;) {
+        const Runs& runs = by_method[i];
+        const std::string label = runs[0]->about_method().label;
+        out += (out.empty() ? heading + ": " : "; ") + label + if_unfinished({runs}, " (unfinished)") + " ";
+        if (spread_of(runs, final_value, gridworld ? &Run::length : &Run::score).count == 0)
+            out += "has no result yet";
+        else
+            out += gridworld ? compare_grid_world(runs) : compare_scores(runs, paper->by_method[runs[0]->method]);
+        if (!runs[0]->offline_only()) interactions += label + " " + interactions_text(runs) + ", ";
+    }
+    if (!interactions.empty())
+        out += "; online interactions: " + interactions + "paper " + (gridworld ? "20,000" : "200,000");
+    const std::string data = setting_or(any, "dataset", "").source;
+    if (!gridworld && !data.empty() && data != "D4RL's published file") out += "; the data set is not D4RL's file";
+    return out + ".";
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
 // Figures of one task and preset
 
 // Means over seeds: a curve for each method that interacts, a line across for DT.
@@ -849,13 +933,14 @@ inline Section make_section(const Runs& runs) {
     section.heading = any.task + ", preset " + any.preset;
     if (any.mujoco_task) section.heading += ", physics " + physics_name(any);
     if (any.physics != Physics::d4rl) name += "-physics-" + physics_name(any);
+    section.verdict = compare_with_paper(section.heading, by_method);
     (any.task == "gridworld" ? add_gridworld : add_other_task)(section, by_method, name);
     section.tables.push_back(repeat_table(by_method));
     return section;
 }
 
 inline const char* how_to_read =
-    "One section for each task and preset. All numbers come from the run folders, except those in the column marked as the paper's. "
+    "One section for each task and preset. All numbers come from the run folders, except those marked as the paper's. "
     "\"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). A run that has not finished is "
     "marked so and counts with its latest evaluation. The last table has the commands that repeat the runs; the file "
     "settings in a run's folder has the value of every setting and where it came from.";
@@ -879,8 +964,8 @@ inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
 
 }  // namespace results
 
-// Writes report.html, report.md and the figures into `out_folder`; returns the tables as text for a terminal.
-// Errors: report.nothing, report.write, and those above.
+// Writes report.html, report.md and the figures into `out_folder`; returns the tables as text for a terminal, and one
+// sentence for each task that compares it with the paper. Errors: report.nothing, report.write, and those above.
 inline std::string report(const std::vector<std::string>& folders, const std::string& out_folder) {
     using namespace results;
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
@@ -899,6 +984,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
         for (const Figure& figure : section.figures) write_file_atomic(out_folder + "/" + figure.file, figure.svg);
         if (!section.tables.empty()) text += section.heading + "\n\n";
         for (const Table& table : section.tables) text += text_table(table) + "\n";
+        if (!section.verdict.empty()) text += section.verdict + "\n\n";
     }
     const std::string title =
         "WODTEM: report on " + std::to_string(runs.size()) + (runs.size() == 1 ? " run" : " runs");

@@ -249,6 +249,88 @@ TEST(report_states_what_the_folders_hold) {
     CHECK(read_file(out + "/report.html") == page);
 }
 
+// The sentence must stand at the end of the text for a terminal, and on both pages above the first section.
+void check_verdict(const std::vector<std::string>& folders, const std::string& out, const std::string& verdict) {
+    const std::string text = report(folders, out);
+    const std::string page = read_file(out + "/report.html"), markdown = read_file(out + "/report.md");
+    CHECK_CONTAINS(text, verdict + "\n\n");
+    CHECK(text.ends_with(verdict + "\n\n"));
+    CHECK_EQUAL(markdown.find("\n\n" + verdict + "\n"), markdown.find('\n'));
+    CHECK_EQUAL(page.find("</h1>\n<p>" + svg::escaped(verdict) + "</p>\n<h2>"), page.find("</h1>"));
+}
+
+TEST(grid_world_is_compared_with_the_paper_in_one_sentence) {
+    const TemporaryFolder temporary;
+    const auto run = [&](const char* method, int seed, int length) {
+        return write_run(temporary.path, method, seed, {{0, 50}, {900 + seed, length}});
+    };
+    const std::string out = temporary.path + "/out", start = "gridworld, preset paper: ";
+    const std::string odt = run("odt", 0, 100), wodtem = run("wodtem", 0, 5);
+    check_verdict(
+        {odt, run("dt", 0, 14), wodtem}, out,
+        start +
+            "WODTEM takes 5.00 steps (return 1.00), the shortest path, which agrees with the paper: 5 (sec. V-D), "
+            "return 1; ODT takes 100.00 steps (return 0.00), never reaching the goal, which does not agree with "
+            "the paper: about 7 (sec. IV-A), return 1; DT takes 14.00 steps (return 1.00); the paper gives no "
+            "number (fig. 4a); online interactions: WODTEM 900, ODT 900, paper 20,000.");
+    // Seeds of 6 and 8 steps: mean 7, deviation sqrt(2). Seeds of 5 and 6 steps are not the paper's 5.
+    check_verdict({run("odt", 0, 6), run("odt", 1, 8), wodtem, run("wodtem", 1, 6)}, out,
+                  start +
+                      "WODTEM takes 5.50 ± 0.71 steps (return 1.00 ± 0.00), which does not agree with the paper: 5 "
+                      "(sec. V-D), return 1; ODT takes 7.00 ± 1.41 steps (return 1.00 ± 0.00), which agrees with the "
+                      "paper: about 7 (sec. IV-A), return 1; online interactions: WODTEM 900–901, ODT 900–901, "
+                      "paper 20,000.");
+    // About 7 ends below 8 and above 6.
+    for (const int length : {6, 8, 10})
+        check_verdict({run("odt", 0, length)}, out,
+                      start + "ODT takes " + std::to_string(length) +
+                          ".00 steps (return 1.00), which does not agree with the paper: about 7 (sec. IV-A), return "
+                          "1; online interactions: ODT 900, paper 20,000.");
+    // Unfinished, and without an evaluation.
+    std::filesystem::remove(odt + "/finished");
+    write(odt, "progress.csv", "interactions,eval_length,eval_return,eval_score\n");
+    check_verdict({odt}, out,
+                  start + "ODT (unfinished) has no result yet; online interactions: ODT 113, paper 20,000.");
+}
+
+TEST(scores_are_compared_with_table_three) {
+    // The sums that the paper prints under each group of data sets: DT, ODT, WODTEM.
+    const double printed[3][3] = {{499.33, 585.66, 598.10}, {105.80, 136.20, 138.80}, {97.99, 183.96, 255.67}};
+    const std::pair<size_t, size_t> groups[] = {{0, 8}, {8, 10}, {10, 13}};
+    for (size_t group = 0; group < 3; ++group)
+        for (size_t method = 0; method < 3; ++method) {
+            double sum = 0;
+            for (size_t i = groups[group].first; i < groups[group].second; ++i)
+                sum += paper_scores[i].by_method[method].mean;
+            CHECK_CLOSE(sum, printed[group][method], 1e-9);
+        }
+
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", d4rl = "physics = d4rl # chosen\nmujoco = 2.2.2 # a\n";
+    const auto run = [&](const char* task, const char* method, double score, const std::string& settings) {
+        return write_mujoco_run(temporary.path, task, method, 0, {{0, 300, 30, 1}, {4000, 300, 60, score}}, settings);
+    };
+    const std::string task = "maze2d-umaze-v1", start = task + ", preset paper, physics d4rl: ";
+    check_verdict(
+        {run("maze2d-umaze-v1", "dt", 27.7, d4rl + "dataset = a # not known as a published file\n"),
+         run("maze2d-umaze-v1", "odt", 39.32, d4rl), run("maze2d-umaze-v1", "wodtem", 64.38, d4rl)},
+        out,
+        start +
+            "WODTEM scores 64.38, below the paper's 75.18 ± 10.79; ODT scores 39.32, above the paper's 31.85 ± "
+            "7.46; DT scores 27.70, below the paper's 39.95 ± 12.17; online interactions: WODTEM 4,000, ODT "
+            "4,000, paper 200,000; the data set is not D4RL's file.");
+    check_verdict({run("maze2d-umaze-v1", "wodtem", 64.40, d4rl + "dataset = a # D4RL's published file\n")}, out,
+                  start +
+                      "WODTEM scores 64.40, within the paper's 75.18 ± 10.79; online interactions: WODTEM 4,000, "
+                      "paper 200,000.");
+    // A level of the data is part of the name; a task without a level, or unknown, is not in the table.
+    check_verdict(
+        {run("hopper-medium-replay-v2", "dt", 62.75, d4rl)}, out,
+        "hopper-medium-replay-v2, preset paper, physics d4rl: DT scores 62.75, within the paper's 62.75 ± 15.05.");
+    for (const char* other : {"hopper-v2", "elsewhere"})
+        CHECK(report({run(other, "wodtem", 50, d4rl)}, out).find("the paper") == std::string::npos);
+}
+
 TEST(report_of_a_run_that_has_just_begun_has_dashes) {
     const TemporaryFolder temporary;
     write(temporary.path + "/run", "settings",
@@ -268,15 +350,14 @@ TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
             write_mujoco_run(temporary.path, "hopper-medium-v2", "dt", 0, {{0, 500, 1500, 47}})},
            out);
     const std::string page = read_file(out + "/report.md");
-    for (
-        const char* part :
-        {"hopper-medium-v2, preset paper, physics d4rl\n",
-         "All runs: physics d4rl on MuJoCo 2.2.2, masses and inertias as "
-         "in MuJoCo up to 2.1.0, which made D4RL's data. Score 0 is a mean return of −20.27, score 100 one of 3,234.30.",
-         "Normalised score, as D4RL defines it", "| DT | 1 | 47.00 ± - | 47.00 ± - | 1,500.00 ± - | 500.00 ± - | 0 |",
-         // scores 70 and 50 (nan is passed over), means (61 + 70) / 2 and (40 + 50) / 2
-         "| ODT | 2 | 60.00 ± 14.14 | 55.25 ± 14.50 | 1,600.00 ± 2,262.74 | 850.00 ± 212.13 | 5,000–5,100 |",
-         "--method odt --preset paper --seeds 0-1 --physics d4rl |"})
+    for (const char* part :
+         {"hopper-medium-v2, preset paper, physics d4rl\n",
+          "All runs: physics d4rl on MuJoCo 2.2.2, masses and inertias as in MuJoCo up to 2.1.0, which made D4RL's "
+          "data. Score 0 is a mean return of −20.27, score 100 one of 3,234.30.",
+          "Normalised score, as D4RL defines it", "| DT | 1 | 47.00 ± - | 47.00 ± - | 1,500.00 ± - | 500.00 ± - | 0 |",
+          // scores 70 and 50 (nan is passed over), means (61 + 70) / 2 and (40 + 50) / 2
+          "| ODT | 2 | 60.00 ± 14.14 | 55.25 ± 14.50 | 1,600.00 ± 2,262.74 | 850.00 ± 212.13 | 5,000–5,100 |",
+          "--method odt --preset paper --seeds 0-1 --physics d4rl |"})
         CHECK_CONTAINS(page, part);
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-curve.svg"), ">normalised score<");
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-length.svg"), ">evaluation length, steps<");
