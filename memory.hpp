@@ -2,17 +2,15 @@
 //   sec. III-A      g_t and d_t                     returns_to_go, discounted_returns, relabel
 //   sec. III-A      D_offline, D_online             offline_set, ReplayBuffer
 //   sec. IV-B.1     the table Q, eq. (4)            EpisodicMemory::update    (the paper's rule between (3) and (5))
-//   sec. IV-B.2     K(s_q), eqs. (5) and (6)        nearest, search, approximate_return, remembered_action
+//   sec. IV-B.2     K(s_q), eqs. (5) and (6)        nearest, search, is_optimal, advised_action
 //   sec. IV-B.3     eq. (7)                         weight
 // Promises: exact nearest neighbours; every tie has a stated winner, so results depend on the order of updates and
 // look-ups and on nothing else (not on when the search tree was built, not on a save and load in between); a refused
-// trajectory leaves the table as it was. Leaves out: networks, environments, files, threads (search() is safe in many).
+// trajectory leaves the table as it was. Leaves out: networks, files, threads (many threads may call search() at once).
 //
-// Memory per entry, with projected_dim 4, action_dim 8 and a full table of 2e6: 88 bytes saved (key 16, projected state
-// 16, action 32, e 8, priority 8, age 8) and 77 to 93 derived (hash slots 8.4, search tree 45 to 61, eviction heap 24):
-// 330 to 362 MB. Building the tree takes 8 more per entry for a moment. The raw state is not kept: its key and
-// projection are. At that size, on one core of an EPYC (README): a look-up (K = 2, thousands at once) takes 0.6
-// microseconds, an insertion 0.8, one that evicts 2.4, building the tree 0.9 seconds.
+// Memory per entry, with projected_dim 4 and action_dim 8: 88 bytes are saved (key 16, projected state 16, action 32,
+// e 8, priority 8, age 8); the hash table, the eviction heap and the search tree are derived from them and take about as
+// much again. The raw state is not kept. Times of a look-up, an insertion and an eviction: tests/BENCH.md.
 #pragma once
 
 #include <algorithm>
@@ -142,12 +140,11 @@ struct ReplayBuffer {
             ends.push_back((ends.empty() ? 0 : ends.back()) + static_cast<uint64_t>(trajectory.length()));
     }
 
-    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory with probability proportional to its length,
-    // a start uniform over its steps, then the next min(context_length, what is left) steps: windows near the end are
-    // short.
+    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory is drawn with probability proportional to its
+    // length and a start uniformly from its steps; the window is the next min(context_length, steps left) steps. So
+    // windows that start near the end of a trajectory are short.
     // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
-    // One draw over all steps laid end to end
-    // gives both exactly: a trajectory owns `length` of the `total` numbers, each of them one start.
+    // One number drawn from all steps laid end to end has exactly these probabilities, for each step is one start.
     Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length) const {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
         return window_at(random.below(ends.back(), update, window_index), context_length);
@@ -232,10 +229,20 @@ inline float squared_distance(const float* a, const float* b, size_t dim) {
     return sum;
 }
 
-// What the tree knows of the table. An age is an insertion number: smaller is older, and no two are equal.
+// K(s_q) of many queries s_q.
+struct Neighbourhoods {
+    size_t K = 0;
+    std::vector<Neighbour> rows = {};  // [query, K], closest first
+    std::vector<size_t> counts = {};   // [query] how many of a row are in use
+
+    size_t size() const { return counts.size(); }
+    std::span<const Neighbour> operator[](size_t i) const { return {rows.data() + i * K, counts[i]}; }
+};
+
+// What the tree reads of the table. An age is an insertion number: smaller is older, and no two are equal.
 struct Points {
-    const float* rows;  // [entry, dim]
-    const uint64_t* ages;
+    const float* rows;     // [entry, dim]
+    const uint64_t* ages;  // [entry]
 
     // The order of neighbours. Ties: smaller distance, then older entry.
     bool closer(const Neighbour& a, const Neighbour& b) const {
@@ -243,508 +250,218 @@ struct Points {
     }
 };
 
-// A search for the nearest entries to a point.
-struct Query {
-    const float* point;
-    uint32_t skipped;  // the entry that does not count, or no_entry
-    Neighbour* best;   // room for K of them; found, closest first:
-    size_t found = 0;
-};
-
-// A tree of bounding boxes, 16 to a node, that grows like a B-tree: all leaves are equally deep, a full node splits in
-// two. (Guttman, "R-trees", SIGMOD 1984.) In level 0 the lanes of a node hold entries; in a level above, nodes of the
-// level below, each with its box and the age of its oldest entry. The lanes lie side by side: one pass of vector code
-// gives 16 distances. Splits keep boxes apart, which is what makes a search short; nothing else depends on the shape.
-struct BoxTree {
-    static constexpr size_t lanes = 16;
-    static constexpr size_t fewest = 4;        // lanes in use, but for the root; those in use come first
-    static constexpr size_t comfortable = 12;  // lanes in use after building: room for more
-    // Two halves of a node may overlap by this part of its extent. None at all: insertion takes two and a half times as
-    // long, because more is built anew. 0.04: a look-up takes 1.3 times as long.
-    static constexpr float tolerance = 0.01f;
+// A bucket k-d tree (Friedman, Bentley and Finkel, 1977) that grows and shrinks with the table. An inner node parts its
+// entries by a plane: coordinate `dim` is at most `split` below its low child and at least `split` below its high child.
+// Equal coordinates may thus lie on both sides, and identical points can be divided like any others. A leaf holds up to
+// 16 entries; their coordinates lie side by side, so that one pass of vector code gives all distances. A node with a
+// child of more than 3/4 of its entries, or with too few entries for two leaves, is built anew. So no path is longer
+// than about log(n) / log(4/3), whatever the order of insertions and removals. No result depends on the tree's shape.
+struct KdTree {
+    static constexpr uint32_t lanes = 16;         // entries in a full leaf
+    static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `dim` in a leaf
+    static constexpr size_t longest_path = 96;    // log(2^31) / log(4/3) = 75, and some for rounding
 
     template <class Number>
     struct alignas(64) Lanes : std::array<Number, lanes> {};
-
-    struct Level {
-        std::vector<Lanes<float>> boxes;      // [node, dim, side] lowest, highest coordinate; in level 0 one for both
-        std::vector<Lanes<uint32_t>> child;   // [node] entry, or node of the level below; no_entry: nothing
-        std::vector<Lanes<uint64_t>> oldest;  // [node] not in level 0: there the table has it
-        std::vector<uint32_t> home;           // [child] the node it is in
-        std::vector<uint32_t> unused;         // nodes
+    struct Node {
+        uint32_t child;  // inner node: its low child, the high child follows it. Leaf: its place in the arrays below
+        uint32_t dim;
+        float split;
+        uint32_t count;  // entries below
     };
+    using Ranked = std::pair<float, uint32_t>;  // (coordinate, entry)
 
     size_t dim = 0;
-    std::vector<Level> levels = {};
-    uint32_t root = 0;  // in the last level
-
-    static size_t sides(size_t level) { return level == 0 ? 1 : 2; }
-    size_t top() const { return levels.size() - 1; }
-    Lanes<uint32_t>& child(size_t level, size_t node) { return levels[level].child[node]; }
-    Lanes<float>& low(size_t level, size_t node, size_t d) {
-        return levels[level].boxes[(node * dim + d) * sides(level)];
-    }
-    Lanes<float>& high(size_t level, size_t node, size_t d) {
-        return levels[level].boxes[(node * dim + d + 1) * sides(level) - 1];
-    }
-    size_t lane_of(size_t level, size_t node, uint32_t what) const {
-        const Lanes<uint32_t>& list = levels[level].child[node];
-        return static_cast<size_t>(std::find(list.begin(), list.end(), what) - list.begin());
-    }
-    // Looks at all lanes at once, and so waits for one that has just been stored.
-    size_t used(size_t level, size_t node) const {
-        const Lanes<uint32_t>& list = levels[level].child[node];
-        return static_cast<size_t>(std::countr_one(lanes_where([&](size_t i) { return list[i] != no_entry; })));
-    }
-
-    // ---- nodes and lanes
-
-    template <class Column>
-    static void grow(Column& column, size_t size, const typename Column::value_type& value) {
-        if (size > column.capacity()) column.reserve(size + size / 4);
-        column.resize(size, value);
-    }
-
-    uint32_t add_node(size_t level) {
-        Level& at = levels[level];
-        const uint32_t node = at.unused.empty() ? static_cast<uint32_t>(at.child.size()) : at.unused.back();
-        if (!at.unused.empty()) return at.unused.pop_back(), node;
-        grow(at.boxes, (node + 1) * dim * sides(level), {});
-        grow(at.child, node + 1, {});
-        if (level > 0) grow(at.oldest, node + 1, {});
-        for (size_t lane = 0; lane < lanes; ++lane) clear_lane(level, node, lane);
-        return node;
-    }
-
-    // An empty lane is infinitely far from every point.
-    void clear_lane(size_t level, size_t node, size_t lane) {
-        child(level, node)[lane] = no_entry;
-        for (size_t d = 0; d < dim; ++d) {
-            high(level, node, d)[lane] = -INFINITY;
-            low(level, node, d)[lane] = INFINITY;
-        }
-    }
-
-    void set_child(size_t level, size_t node, size_t lane, uint32_t what) {
-        child(level, node)[lane] = what;
-        std::vector<uint32_t>& home = levels[level].home;
-        if (what >= home.size()) grow(home, what + 1, no_entry);
-        home[what] = static_cast<uint32_t>(node);
-    }
-
-    void move_lane(size_t level, size_t from, size_t from_lane, size_t to, size_t to_lane) {
-        set_child(level, to, to_lane, child(level, from)[from_lane]);
-        for (size_t d = 0; d < dim; ++d) {
-            low(level, to, d)[to_lane] = low(level, from, d)[from_lane];
-            high(level, to, d)[to_lane] = high(level, from, d)[from_lane];
-        }
-        if (level > 0) levels[level].oldest[to][to_lane] = levels[level].oldest[from][from_lane];
-    }
-
-    void erase_lane(size_t level, size_t node, size_t lane) {
-        const size_t last = used(level, node) - 1;
-        if (lane != last) move_lane(level, node, last, node, lane);
-        clear_lane(level, node, last);
-    }
-
-    void put_entry(const Points& points, size_t leaf, size_t lane, uint32_t entry) {
-        set_child(0, leaf, lane, entry);
-        for (size_t d = 0; d < dim; ++d) low(0, leaf, d)[lane] = points.rows[entry * dim + d];
-    }
-
-    void put_node(const Points& points, size_t level, size_t node, size_t lane, uint32_t below) {
-        set_child(level, node, lane, below);
-        enclose(points, level, node, lane);
-    }
-
-    // Fits the box in a lane to what is below. Returns whether it did not fit.
-    bool enclose(const Points& points, size_t level, size_t node, size_t lane) {
-        const uint32_t below = child(level, node)[lane];
-        const size_t n = used(level - 1, below);
-        bool changed = false;
-        const auto set = [&](auto& old, auto now) { changed |= old != now, old = now; };
-        for (size_t d = 0; d < dim; ++d) {
-            const Lanes<float>&lows = low(level - 1, below, d), &highs = high(level - 1, below, d);
-            set(low(level, node, d)[lane], *std::min_element(lows.begin(), lows.begin() + n));
-            set(high(level, node, d)[lane], *std::max_element(highs.begin(), highs.begin() + n));
-        }
-        uint64_t oldest = ~uint64_t{0};
-        for (size_t i = 0; i < n; ++i)
-            oldest = std::min(oldest, level > 1 ? levels[level - 1].oldest[below][i] : points.ages[child(0, below)[i]]);
-        set(levels[level].oldest[node][lane], oldest);
-        return changed;
-    }
-
-    // ---- building
-
-    using Ranked = std::pair<float, uint32_t>;
-    using Order = std::vector<Ranked>;  // (coordinate to cut by, entry)
-    using Iterator = Order::iterator;
+    std::vector<Node> nodes;                // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
+    std::vector<uint32_t> parents;          // [pair]
+    std::vector<Lanes<float>> coordinates;  // [place, dim]
+    std::vector<Lanes<uint32_t>> entries;   // [place] there is one place for each pair
+    std::vector<uint32_t> home;             // [entry] the node of its leaf
+    std::vector<uint32_t> free_pairs;
 
     // A tree of the table's first n entries.
     void build(const Points& points, size_t point_dim, uint32_t n) {
+        *this = {};
         dim = point_dim;
-        levels.assign(1, {});
-        for (size_t room = lanes; n > room; room *= comfortable) levels.emplace_back();
-        Order order(n);
+        std::vector<Ranked> order(n);
         for (uint32_t i = 0; i < n; ++i) order[i].second = i;
-        root = build_node(points, top(), order.begin(), order.end());
+        take_pair();
+        build_node(points, 0, 0, order);
     }
 
-    uint32_t build_node(const Points& points, size_t level, Iterator begin, Iterator end) {
-        const uint32_t node = add_node(level);
-        if (level == 0) {
-            for (auto i = begin; i != end; ++i) put_entry(points, node, static_cast<size_t>(i - begin), i->second);
-            return node;
+    // Halves the entries by the dimension of the largest extent until they fit leaves. The low child gets the node's
+    // place and the high child that of the new pair; so a subtree that is built anew needs no place from elsewhere.
+    void build_node(const Points& points, uint32_t node, uint32_t place, std::span<Ranked> order) {
+        nodes[node] = {place, leaf, 0.0f, 0};
+        if (order.size() <= lanes) {
+            for (const Ranked& ranked : order) put(points, node, ranked.second);
+            return;
         }
-        size_t room = 1;  // in a comfortable node of the level below
-        for (size_t i = 0; i < level; ++i) room *= comfortable;
-        const size_t n = static_cast<size_t>(end - begin);  // at most half of 16^(level + 1), or else all there is
-        build_lanes(points, level, node, 0, std::clamp((n + room - 1) / room, fewest, lanes - 1), begin, end);
-        return node;
-    }
-
-    // `count` lanes from `lane` on.
-    void build_lanes(const Points& points, size_t level, uint32_t node, size_t lane, size_t count, Iterator begin,
-                     Iterator end) {
-        if (count == 1) return put_node(points, level, node, lane, build_node(points, level - 1, begin, end));
-        const Iterator middle =
-            begin + (end - begin) * static_cast<ptrdiff_t>(count / 2) / static_cast<ptrdiff_t>(count);
-        cut(points, begin, middle, end);
-        build_lanes(points, level, node, lane, count / 2, begin, middle);
-        build_lanes(points, level, node, lane + count / 2, count - count / 2, middle, end);
-    }
-
-    // Entries before `middle` get the lower coordinates in the widest dimension.
-    void cut(const Points& points, Iterator begin, Iterator middle, Iterator end) const {
-        size_t widest = 0;
+        uint32_t widest = 0;
         float extent = -1.0f;
-        for (size_t d = 0; d < dim; ++d) {
-            float least = INFINITY, most = -INFINITY;
-            for (auto i = begin; i != end; ++i) {
-                least = std::min(least, points.rows[i->second * dim + d]);
-                most = std::max(most, points.rows[i->second * dim + d]);
-            }
-            if (most - least > extent) extent = most - least, widest = d;
+        for (uint32_t d = 0; d < dim; ++d) {
+            for (Ranked& ranked : order) ranked.first = points.rows[ranked.second * dim + d];
+            const auto [least, most] = std::minmax_element(order.begin(), order.end());
+            if (most->first - least->first > extent) widest = d;
+            extent = std::max(extent, most->first - least->first);
         }
-        for (auto i = begin; i != end; ++i) i->first = points.rows[i->second * dim + widest];
-        std::nth_element(begin, middle, end);
+        for (Ranked& ranked : order) ranked.first = points.rows[ranked.second * dim + widest];
+        const size_t half = order.size() / 2;
+        std::nth_element(order.begin(), order.begin() + static_cast<ptrdiff_t>(half), order.end());
+        const uint32_t pair = take_pair(), low = 2 * pair;
+        parents[pair] = node;
+        nodes[node] = {low, widest, order[half].first, static_cast<uint32_t>(order.size())};
+        build_node(points, low, place, order.first(half));
+        build_node(points, low + 1, pair, order.subspan(half));
     }
 
-    // ---- coming and going
+    uint32_t take_pair() {
+        if (free_pairs.empty()) {
+            const size_t pairs = parents.size() + 1;
+            free_pairs.push_back(static_cast<uint32_t>(pairs - 1));
+            nodes.resize(2 * pairs);
+            parents.resize(pairs);
+            coordinates.resize(pairs * dim);
+            entries.resize(pairs);
+        }
+        const uint32_t pair = free_pairs.back();
+        free_pairs.pop_back();
+        return pair;
+    }
 
-    // Down to a leaf by the nearest boxes; what is full on the way splits before it is entered.
+    void put(const Points& points, uint32_t node, uint32_t entry) {
+        const uint32_t place = nodes[node].child, lane = nodes[node].count++;
+        for (size_t d = 0; d < dim; ++d) coordinates[place * dim + d][lane] = points.rows[entry * dim + d];
+        entries[place][lane] = entry;
+        if (entry >= home.size()) home.resize(entry + 1);
+        home[entry] = node;
+    }
+
+    bool unbalanced(uint32_t node) const {
+        const auto [child, plane_dim, split, n] = nodes[node];
+        return plane_dim != leaf &&
+               (n <= lanes / 2 || std::max(nodes[child].count, nodes[child + 1].count) > n - n / 4);
+    }
+
     void insert(const Points& points, uint32_t entry) {
-        const float* point = points.rows + entry * dim;
-        if (used(top(), root) == lanes) {
-            levels.emplace_back();
-            const uint32_t below = root;
-            root = add_node(top());
-            put_node(points, top(), root, 0, below);
+        uint32_t node = 0;
+        while (nodes[node].dim != leaf && !unbalanced(node)) {
+            const auto [low, plane_dim, split, n] = nodes[node];
+            const float x = points.rows[entry * dim + plane_dim];
+            ++nodes[node].count;
+            node = low + (x == split ? nodes[low + 1].count < nodes[low].count : x > split);
         }
-        uint32_t node = root;
-        for (size_t level = top(); level > 0; --level) {
-            size_t lane = nearest_lane(level, node, point, 0);
-            send_for(level - 1, child(level, node)[lane]);
-            if (used(level - 1, child(level, node)[lane]) == lanes) {
-                const size_t halves = split(points, level, node, lane);
-                lane = nearest_lane(level, node, point, halves);
-            }
-            for (size_t d = 0; d < dim; ++d) {
-                float &least = low(level, node, d)[lane], &most = high(level, node, d)[lane];
-                if (point[d] < least) least = point[d];
-                if (point[d] > most) most = point[d];
-            }
-            uint64_t& oldest = levels[level].oldest[node][lane];
-            oldest = std::min(oldest, points.ages[entry]);
-            node = child(level, node)[lane];
-        }
-        put_entry(points, node, used(0, node), entry);
-    }
-
-    // Sends for the leaves where these points would go, and for what leads there.
-    void send_for_leaves(const std::vector<const float*>& at) const {
-        std::vector<uint32_t> node(at.size(), root);
-        for (size_t level = top(); level > 0; --level)
-            for (size_t i = 0; i < at.size(); ++i) {
-                const size_t lane = nearest_lane(level, node[i], at[i], 0);
-                __builtin_prefetch(&levels[level].oldest[node[i]][lane]);
-                node[i] = levels[level].child[node[i]][lane];
-                send_for(level - 1, node[i]);
-            }
-    }
-
-    // Makes two nodes, in the last two lanes, of the one in a lane: its lanes move where a plane parts them well, else
-    // its entries are divided and both halves built anew. Returns the first of those lanes.
-    size_t split(const Points& points, size_t level, size_t node, size_t lane) {
-        const uint32_t below = child(level, node)[lane];
-        for (size_t i = 0; level == 1 && i < lanes; ++i)  // enclose() will ask for them
-            __builtin_prefetch(&points.ages[child(0, below)[i]]);
-        const Parting parting = best_parting(level, node, lane);
-        erase_lane(level, node, lane);
-        const size_t first = used(level, node);
-        if (parting.overlap <= tolerance) {
-            const uint32_t halves[2] = {add_node(level - 1), add_node(level - 1)};
-            for (size_t i = 0; i < lanes; ++i) {
-                const bool upper = i >= parting.first;
-                move_lane(level - 1, below, parting.order[i].second, halves[upper], upper ? i - parting.first : i);
-            }
-            release(level - 1, below);
-            for (size_t half = 0; half < 2; ++half) put_node(points, level, node, first + half, halves[half]);
-        } else {
-            Order order;
-            take_apart(level - 1, below, order);
-            const Iterator middle = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
-            cut(points, order.begin(), middle, order.end());
-            put_node(points, level, node, first, build_node(points, level - 1, order.begin(), middle));
-            put_node(points, level, node, first + 1, build_node(points, level - 1, middle, order.end()));
-        }
-        return first;
-    }
-
-    struct Parting {
-        float overlap = INFINITY;         // part of the extent in the dimension of the plane
-        size_t first = 0;                 // lanes on its lower side
-        std::array<Ranked, lanes> order;  // (centre, lane)
-    };
-
-    // Of the planes that part the node in a lane and leave enough of its lanes on both sides: a tolerable or else the
-    // least overlap, then the widest dimension, then the most even halves.
-    Parting best_parting(size_t level, size_t node, size_t lane) {
-        const uint32_t below = child(level, node)[lane];
-        std::vector<Ranked> widest;  // dimensions, by minus their extent
-        for (uint32_t d = 0; d < dim; ++d)
-            widest.push_back({low(level, node, d)[lane] - high(level, node, d)[lane], d});
-        std::sort(widest.begin(), widest.end());
-        Parting best;
-        for (size_t w = 0; w < dim && widest[w].first < 0.0f && best.overlap > tolerance; ++w) {
-            const size_t d = widest[w].second;
-            const Lanes<float>&lows = low(level - 1, below, d), &highs = high(level - 1, below, d);
-            Parting next;
-            for (uint32_t i = 0; i < lanes; ++i) next.order[i] = {0.5f * lows[i] + 0.5f * highs[i], i};
-            std::sort(next.order.begin(), next.order.end());
-            Lanes<float> most = {}, least = {};  // of the lanes up to i, of those from i on
-            for (size_t i = 0; i < lanes; ++i)
-                most[i] = std::max(highs[next.order[i].second], i > 0 ? most[i - 1] : -INFINITY);
-            for (size_t i = lanes; i-- > 0;)
-                least[i] = std::min(lows[next.order[i].second], i + 1 < lanes ? least[i + 1] : INFINITY);
-            for (size_t i = 0; i <= lanes - 2 * fewest; ++i) {  // 8, 7, 9, 6, 10 ...
-                next.first = i % 2 ? lanes / 2 - (i + 1) / 2 : lanes / 2 + i / 2;
-                next.overlap = std::max(tolerance, (most[next.first - 1] - least[next.first]) / -widest[w].first);
-                if (next.overlap < best.overlap) best = next;
-            }
-        }
-        return best;
-    }
-
-    void release(size_t level, uint32_t node) {
-        for (size_t lane = 0; lane < lanes; ++lane) clear_lane(level, node, lane);
-        levels[level].unused.push_back(node);
-    }
-
-    // Appends the entries below a node, and gives up the nodes.
-    void take_apart(size_t level, uint32_t node, Order& order) {
-        for (size_t lane = 0, end = used(level, node); lane < end; ++lane) {
-            const uint32_t what = child(level, node)[lane];
-            if (level == 0) order.push_back({0.0f, what});
-            if (level > 0) take_apart(level - 1, what, order);
-        }
-        release(level, node);
+        if (nodes[node].dim == leaf && nodes[node].count < lanes) return put(points, node, entry);
+        rebuild(points, node, {{0.0f, entry}});
     }
 
     void remove(const Points& points, uint32_t entry) {
-        const uint32_t leaf = levels[0].home[entry];
-        erase_lane(0, leaf, lane_of(0, leaf, entry));
-        tidy(points, 0, leaf);
-    }
-
-    // After a lane has gone, or its box has shrunk: a node with too few lanes is given up, and what it held put back.
-    void tidy(const Points& points, size_t level, uint32_t node) {
-        if (level == top()) {
-            if (level > 0 && used(level, node) == 1) root = child(level, node)[0], levels.pop_back();
-            return;
+        uint32_t node = home[entry], highest = no_entry;  // the highest unbalanced node
+        const uint32_t place = nodes[node].child, last = --nodes[node].count;
+        const auto lane = std::find(entries[place].begin(), entries[place].end(), entry) - entries[place].begin();
+        entries[place][lane] = entries[place][last];
+        for (size_t d = 0; d < dim; ++d) coordinates[place * dim + d][lane] = coordinates[place * dim + d][last];
+        while (node != 0) {
+            node = parents[node / 2];
+            --nodes[node].count;
+            if (unbalanced(node)) highest = node;
         }
-        const uint32_t parent = levels[level + 1].home[node];
-        const size_t lane = lane_of(level + 1, parent, node);
-        if (used(level, node) >= fewest) {
-            if (enclose(points, level + 1, parent, lane)) tidy(points, level + 1, parent);
-            return;
+        if (highest != no_entry) rebuild(points, highest, {});
+    }
+
+    // Builds a node anew, from the entries below it and those in `order`.
+    void rebuild(const Points& points, uint32_t node, std::vector<Ranked> order) {
+        const uint32_t place = take_apart(node, order);
+        build_node(points, node, place, order);
+    }
+
+    // Appends the entries below a node to `order` and frees the pairs below. Returns the place that the node was given.
+    uint32_t take_apart(uint32_t node, std::vector<Ranked>& order) {
+        const auto [child, plane_dim, split, n] = nodes[node];
+        if (plane_dim == leaf) {
+            for (uint32_t i = 0; i < n; ++i) order.push_back({0.0f, entries[child][i]});
+            return child;
         }
-        Order order;
-        take_apart(level, node, order);
-        erase_lane(level + 1, parent, lane);
-        tidy(points, level + 1, parent);
-        for (const auto& [coordinate, entry] : order) insert(points, entry);
+        free_pairs.push_back(child / 2);
+        const uint32_t place = take_apart(child, order);
+        take_apart(child + 1, order);
+        return place;
     }
 
-    // ---- searching
-
-    // Squared distances from a point to the boxes of a node; in level 0 to its entries, as squared_distance() has them.
-    // To a box: never above the computed distance of any point x inside. For the nearest point c of the box,
-    // |point - c| <= |point - x| in each coordinate, and rounding, being monotone and odd, keeps this <=, as do squaring
-    // and adding in the same order with the rounding after each.
-    [[gnu::always_inline]] inline Lanes<float> distances(size_t level, size_t node, const float* point) const {
-        const size_t step = sides(level);
-        const Lanes<float>* box = &levels[level].boxes[node * dim * step];
-        Lanes<float> sum = {};
-        for (size_t d = 0; d < dim; ++d, box += step) {
-            const float x = point[d], *lows = box[0].data(), *highs = box[step - 1].data();
-#pragma GCC unroll 1  // vectors of lanes, not of dimensions
-            for (size_t i = 0; i < lanes; ++i) {
-                const float gap = x - std::min(std::max(x, lows[i]), highs[i]);
-                sum[i] += gap * gap;
-            }
-        }
-        return sum;
-    }
-
-    // One bit for each lane of which `holds` is true.
-    template <class Condition>
-    [[gnu::always_inline]] static uint32_t lanes_where(Condition holds) {
-        static constexpr auto bits = [] {  // a table, not a shift: vectors of old cannot shift by lanes
-            std::array<int32_t, lanes> table = {};
-            for (size_t i = 0; i < lanes; ++i) table[i] = 1 << i;
-            return table;
-        }();
-        int32_t mask = 0;
-#pragma GCC unroll 1
-        for (size_t i = 0; i < lanes; ++i) mask |= bits[i] & -static_cast<int32_t>(holds(i));
-        return static_cast<uint32_t>(mask);
-    }
-
-    // The least of the distances. None is negative, so their bits, read as whole numbers, are in the same order; of
-    // those GCC finds the least by vectors.
-    [[gnu::always_inline]] static float least_of(const Lanes<float>& distance) {
-        int32_t least = std::numeric_limits<int32_t>::max();
-#pragma GCC unroll 1
-        for (size_t i = 0; i < lanes; ++i) least = std::min(least, std::bit_cast<int32_t>(distance[i]));
-        return std::bit_cast<float>(least);
-    }
-
-    // So that the node comes from memory while something else is done; into a core's second cache: what all walks of a
-    // search send for does not fit the first.
-    [[gnu::always_inline]] inline void send_for(size_t level, size_t node) const {
-        const size_t lines = dim * sides(level);
-        for (size_t i = 0; i < lines; ++i) __builtin_prefetch(&levels[level].boxes[node * lines + i], 0, 2);
-        __builtin_prefetch(&levels[level].child[node], 0, 2);
-    }
-
-    // Of the lanes from `first` on. Ties: the first.
-    EACH_TARGET size_t nearest_lane(size_t level, size_t node, const float* point, size_t first) const {
-        Lanes<float> distance = distances(level, node, point);
-#pragma GCC unroll 1
-        for (uint32_t i = 0; i < lanes; ++i) distance[i] = i < static_cast<uint32_t>(first) ? INFINITY : distance[i];
-        const float least = least_of(distance);
-        const uint32_t nearest = lanes_where([&](size_t i) { return distance[i] == least; });
-        return static_cast<size_t>(std::countr_zero(nearest >> first)) + first;
-    }
-
-    // A node on the way from the root to where a search is, and what it has not yet opened there.
-    struct Stage {
-        Lanes<float> distance;  // of its lanes; INFINITY: opened, or empty, or too far for a float; none is ever opened
-        float least;            // of them
-        size_t node;
+    struct Walk {              // a query on its way through the tree
+        size_t query;          // its number
+        float reach;           // an entry farther away cannot be a neighbour
+        uint32_t node = 0;     // to be visited next
+        bool fetched = false;  // `node` is a leaf that has been prefetched
+        size_t waiting = 0;
+        std::array<Ranked, longest_path> subtrees = {};  // [waiting] passed by: (squared distance to the plane, node)
     };
 
-    // A search under way.
-    struct Walk {
-        Query* query;
-        float reach;             // what is farther does not count
-        size_t level;            // where it is, at way[level]
-        std::vector<Stage> way;  // [level]
-    };
-
-    // The K nearest entries to each point, but only those nearer than `limit`. Several walks take turns, so that the
-    // next node of each comes from memory while the others compute. All of them scan before any decides: no branch in a
-    // scan depends on what is found, so that one foreseen wrongly costs no distances.
-    EACH_TARGET void search(const Points& points, std::vector<Query>& queries, size_t K, float limit) const {
-        std::vector<Walk> walks(std::min<size_t>(queries.size(), 16));
-        size_t begun = 0;
-        const auto begin = [&](Walk& walk) {
-            walk = {&queries[begun++], limit, top(), std::move(walk.way)};
-            walk.way.resize(levels.size());
-            walk.way[walk.level].node = root;
-        };
-        for (Walk& walk : walks) begin(walk);
-        while (!walks.empty()) {
-            for (Walk& walk : walks) scan(walk);
-            for (size_t i = 0; i < walks.size();) {
-                Walk& walk = walks[i];
-                if (walk.level == 0) take_entries(points, walk, K);
-                if (open_next(points, walk, K)) {
-                    ++i;
-                } else if (begun < queries.size()) {
-                    begin(walk), ++i;
-                } else {
-                    std::swap(walk, walks.back());
-                    walks.pop_back();
-                }
+    // K(s_q) of the queries `at` [query, dim], but only of entries nearer than `limit`. Sixteen walks take one step each
+    // in turn, so that the next node of a walk can come from memory while the others compute.
+    EACH_TARGET void search(const Points& points, const float* at, const uint32_t* skipped, float limit,
+                            Neighbourhoods& found) const {
+        std::vector<Walk> walks;
+        for (size_t i = 0; i < std::min<size_t>(found.size(), 16); ++i) walks.push_back({i, limit});
+        for (size_t left = found.size(), begun = walks.size(); left > 0;)
+            for (Walk& walk : walks) {
+                if (walk.query >= found.size() || step(points, at, skipped, walk, found)) continue;
+                walk.query = begun++;
+                walk.reach = limit;
+                walk.node = 0;
+                --left;
             }
-        }
     }
 
-    [[gnu::always_inline]] inline void scan(Walk& walk) const {
-        Stage& stage = walk.way[walk.level];
-        stage.distance = distances(walk.level, stage.node, walk.query->point);
-        stage.least = least_of(stage.distance);
-    }
-
-    // Whether an entry, or a box whose oldest entry is that old, can be among the K nearest. At equal distances the
-    // older wins; the age is a reference because it lies elsewhere, and is seldom asked for.
-    [[gnu::always_inline]] static bool counts(const Points& points, const Walk& walk, size_t K, float distance,
-                                              const uint64_t& age) {
-        if (distance != walk.reach) return distance < walk.reach;
-        return walk.query->found == K && age < points.ages[walk.query->best[K - 1].entry];
-    }
-
-    [[gnu::always_inline]] inline void take_entries(const Points& points, Walk& walk, size_t K) const {
-        walk.level = 1;  // back to the node above; past the end if the leaf is the root
-        const Stage& stage = walk.way[0];
-        if (!(stage.least <= walk.reach)) return;  // as in most leaves
-        Query& query = *walk.query;
-        for (uint32_t mask = lanes_where([&](size_t i) { return stage.distance[i] <= walk.reach; }); mask != 0;
-             mask &= mask - 1) {
-            const size_t lane = static_cast<size_t>(std::countr_zero(mask));
-            const Neighbour next = {stage.distance[lane], levels[0].child[stage.node][lane]};
-            if (next.entry == query.skipped || next.entry == no_entry) continue;
-            if (!counts(points, walk, K, next.distance, points.ages[next.entry])) continue;
-            size_t k = query.found < K ? query.found++ : K - 1;
-            for (; k > 0 && points.closer(next, query.best[k - 1]); --k) query.best[k] = query.best[k - 1];
-            query.best[k] = next;
-            if (query.found == K) walk.reach = query.best[K - 1].distance;
-        }
-    }
-
-    // Goes to the next box that counts, and sends for its node. Of equally near ones it is the one with the oldest
-    // entry: if that does not count, none of them does. Returns whether there is one.
-    [[gnu::always_inline]] inline bool open_next(const Points& points, Walk& walk, size_t K) const {
-        for (; walk.level < levels.size(); ++walk.level) {
-            Stage& stage = walk.way[walk.level];
-            if (!(stage.least <= walk.reach)) continue;  // NaN: the point is infinite, and nothing near it
-            const Level& level = levels[walk.level];
-            const Lanes<uint64_t>& oldest = level.oldest[stage.node];
-            uint32_t nearest = lanes_where([&](size_t i) { return stage.distance[i] == stage.least; });
-            size_t lane = static_cast<size_t>(std::countr_zero(nearest));
-            while ((nearest &= nearest - 1) != 0)
-                if (const auto i = static_cast<size_t>(std::countr_zero(nearest)); oldest[i] < oldest[lane]) lane = i;
-            if (!counts(points, walk, K, stage.least, oldest[lane])) continue;
-            const uint32_t node = level.child[stage.node][lane];
-            send_for(walk.level - 1, node);
-#pragma GCC unroll 1  // the whole vector: after a store of one lane, loading the vector would wait for it
-            for (size_t i = 0; i < lanes; ++i) stage.distance[i] = i == lane ? INFINITY : stage.distance[i];
-            stage.least = least_of(stage.distance);
-            walk.way[--walk.level].node = node;
+    // Visits one node; returns whether there is another to visit. A subtree beyond a plane can be left out if the plane
+    // is too far: a point beyond has a coordinate at least that far, and rounding, being monotone, keeps that order in
+    // the difference, in its square and in a sum of squares. At equal distances the older entry wins: hence <=.
+    [[gnu::always_inline]] inline bool step(const Points& points, const float* at, const uint32_t* skipped, Walk& walk,
+                                            Neighbourhoods& found) const {
+        const Node& node = nodes[walk.node];
+        if (node.dim != leaf) {
+            const float gap = at[walk.query * dim + node.dim] - node.split;
+            walk.node = gap > 0.0f ? node.child + 1 : node.child;
+            __builtin_prefetch(&nodes[walk.node]);
+            if (gap * gap <= walk.reach) walk.subtrees[walk.waiting++] = {gap * gap, walk.node ^ 1};
             return true;
+        }
+        if (!walk.fetched) {
+            for (size_t d = 0; d < dim; ++d) __builtin_prefetch(&coordinates[node.child * dim + d]);
+            __builtin_prefetch(&entries[node.child]);
+            return walk.fetched = true;
+        }
+        scan(points, at + walk.query * dim, skipped[walk.query], node, walk, found);
+        walk.fetched = false;
+        while (walk.waiting > 0) {
+            const auto [distance, subtree] = walk.subtrees[--walk.waiting];
+            walk.node = subtree;
+            if (distance <= walk.reach) return true;
         }
         return false;
     }
 
-    size_t bytes() const {
-        size_t total = 0;
-        const auto add = [&](const auto& column) { total += column.capacity() * sizeof(column[0]); };
-        for (const Level& level : levels)
-            add(level.boxes), add(level.child), add(level.oldest), add(level.home), add(level.unused);
-        return total;
+    // Takes those entries of a leaf that are among the K nearest so far.
+    [[gnu::always_inline]] inline void scan(const Points& points, const float* point, uint32_t skipped,
+                                            const Node& node, Walk& walk, Neighbourhoods& found) const {
+        Lanes<float> distance = {};
+        for (size_t d = 0; d < dim; ++d)
+#pragma GCC unroll 1  // vectors of lanes, not of dimensions
+            for (size_t i = 0; i < lanes; ++i) {
+                const float gap = coordinates[node.child * dim + d][i] - point[d];
+                distance[i] += gap * gap;
+            }
+        Neighbour* best = &found.rows[walk.query * found.K];
+        size_t& count = found.counts[walk.query];
+        for (size_t i = 0; i < node.count; ++i) {
+            const Neighbour next = {distance[i], entries[node.child][i]};
+            if (!(next.distance <= walk.reach) || next.entry == skipped) continue;
+            if (count < found.K ? next.distance == walk.reach : !points.closer(next, best[count - 1])) continue;
+            size_t k = count < found.K ? count++ : count - 1;
+            for (; k > 0 && points.closer(next, best[k - 1]); --k) best[k] = best[k - 1];
+            best[k] = next;
+            if (count == found.K) walk.reach = best[count - 1].distance;
+        }
     }
 };
 
@@ -777,16 +494,6 @@ inline Words4 state_key(const float* state, size_t state_dim) {
     return h;
 }
 
-// K(s_q) of many queries s_q.
-struct Neighbourhoods {
-    size_t K = 0;
-    std::vector<Neighbour> rows = {};  // [query, K], closest first
-    std::vector<size_t> counts = {};   // [query] how many of a row are in use
-
-    size_t size() const { return counts.size(); }
-    std::span<const Neighbour> operator[](size_t i) const { return {rows.data() + i * K, counts[i]}; }
-};
-
 struct EpisodicMemory {
     struct Changes {
         uint64_t inserted = 0, improved = 0, kept = 0, evicted = 0;  // entries; the first three sum to T
@@ -813,7 +520,7 @@ struct EpisodicMemory {
     // Derived: never saved, rebuilt by rebuild_derived().
     std::vector<uint32_t> slots;  // hash table of entries: open addressing, linear probing, a power of two long
     std::vector<HeapItem> heap;   // empty until the first eviction, then one item per entry
-    BoxTree tree;                 // over `projected`
+    KdTree tree;                  // over `projected`
 
     EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
         : config(settings),
@@ -851,25 +558,15 @@ struct EpisodicMemory {
         check_finite("actions", trajectory.actions.data(), T * A);
         check_finite("discounted returns", trajectory.discounted_returns.data(), T);
         Changes changes;
-        // Sixteen states at a time: what they will touch comes from memory for all of them at once. No more than a
-        // hint: one may be evicted before its turn, or another change the leaf where it will go.
-        std::array<Words4, 16> key;
-        std::vector<float> point(key.size() * dim);
-        std::vector<const float*> unknown;
-        for (size_t first = 0; first < T; first += key.size()) {
-            const size_t n = std::min(key.size(), T - first);
-            for (size_t i = 0; i < n; ++i) {
-                key[i] = state_key(&trajectory.states[(first + i) * S], S);
-                project(&trajectory.states[(first + i) * S], &point[i * dim]);
-                __builtin_prefetch(&slots[key[i][0] & (slots.size() - 1)]);
-            }
-            unknown.clear();
-            for (size_t i = 0; i < n; ++i)
-                if (slots[find_slot(key[i])] == no_entry) unknown.push_back(&point[i * dim]);
-            tree.send_for_leaves(unknown);
-            for (size_t i = 0, t = first; i < n; ++i, ++t)
-                update_one(changes, key[i], &point[i * dim], &trajectory.actions[t * A],
-                           trajectory.discounted_returns[t]);
+        std::vector<Words4> key(T);
+        for (size_t t = 0; t < T; ++t) {
+            key[t] = state_key(&trajectory.states[t * S], S);
+            __builtin_prefetch(&slots[key[t][0] & (slots.size() - 1)]);  // find_slot() looks there first
+        }
+        std::vector<float> point(dim);
+        for (size_t t = 0; t < T; ++t) {
+            project(&trajectory.states[t * S], point.data());
+            update_one(changes, key[t], point.data(), &trajectory.actions[t * A], trajectory.discounted_returns[t]);
         }
         return changes;
     }
@@ -1016,18 +713,15 @@ struct EpisodicMemory {
         return found;
     }
 
-    // The same from the tree, for many points at once.
+    // The same from the tree, for many projected states `at` [n, dim] and the entries skipped [n] at once.
     Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped) const {
         Neighbourhoods found{static_cast<size_t>(config.K), {}, {}};
         found.rows.resize(skipped.size() * found.K);
-        std::vector<Query> queries;
-        for (size_t i = 0; i < skipped.size(); ++i)
-            queries.push_back({&at[i * dim], skipped[i], &found.rows[i * found.K]});
+        found.counts.resize(skipped.size());
         // The smallest float that is not below epsilon: the same floats are below both.
         float limit = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
         if (limit < config.epsilon) limit = std::nextafter(limit, INFINITY);
-        tree.search(points(), queries, found.K, limit);
-        for (const Query& query : queries) found.counts.push_back(query.found);
+        tree.search(points(), at.data(), skipped.data(), limit, found);
         return found;
     }
 
@@ -1049,14 +743,14 @@ struct EpisodicMemory {
 
     // ---- eqs. (5) to (7). `found` is K(s_q).
 
-    // exp(-q_k) over exp(-q_1), the largest: the quotient in (5) is the same and no epsilon can make it 0 / 0. The float
-    // exp: libm's in double gives other bits on other processors. Sums are in double.
+    // exp(-q_k) / exp(-q_1), where q_1 is the smallest distance: the quotient in eq. (5) is the same, and no distance can
+    // make it 0 / 0. The float exp is used, because the bits of libm's double exp depend on the processor.
     static double similarity(std::span<const Neighbour> found, size_t k) {
         return std::exp(found[0].distance - found[k].distance);
     }
 
-    // WODTEM eq. (5): e-hat(s_q) = sum_k p_k e_k, p_k = exp(-q(s_q, s_k)) / sum_k1 exp(-q(s_q, s_k1)).
-    // NaN, that is unknown, for an empty K(s_q).
+    // e-hat(s_q) of eq. (5) as it is written, for the golden vectors and the tests; training compares by is_optimal().
+    // Returns NaN, that is unknown, for an empty K(s_q).
     double approximate_return(std::span<const Neighbour> found) const {
         double sum = 0.0, normaliser = 0.0;
         for (size_t k = 0; k < found.size(); ++k) {
@@ -1066,38 +760,42 @@ struct EpisodicMemory {
         return sum / normaliser;
     }
 
-    // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
-    // e reaches thousands, exp(89) overflows float: the largest e is subtracted first. Returns action_dim numbers.
-    const float* remembered_action(std::span<const Neighbour> found, double uniform) const {
-        if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to remember");
-        double best = e[found[0].entry], total = 0.0, cumulative = 0.0;
-        for (const Neighbour& neighbour : found) best = std::max(best, e[neighbour.entry]);
-        const auto odds = [&](const Neighbour& neighbour) {
-            return double{std::exp(static_cast<float>((e[neighbour.entry] - best) / config.tau))};
-        };
-        for (const Neighbour& neighbour : found) total += odds(neighbour);
-        // uniform <= 1 - 2^-53 makes uniform * total < total also when rounded, and the sums below end in total: one of
-        // the neighbours is chosen, and never one of probability 0, which leaves the sum where it was.
-        size_t k = 0;
-        while (k + 1 < found.size() && (cumulative += odds(found[k])) <= uniform * total) ++k;
-        return &actions[found[k].entry * A];
-    }
-
-    // Is a_c "the historical optimal action": d >= e-hat(s)? Tested as sum_k p_k (e_k - d) <= 0, which is exact where
-    // it matters: a rounded mean of equal numbers can exceed them, and give alpha for nothing. No neighbours: yes,
-    // nothing speaks against it.
+    // WODTEM eq. (5): e-hat(s_q) = sum_k p_k e_k, p_k = exp(-q(s_q, s_k)) / sum_k1 exp(-q(s_q, s_k1)).
+    // Returns whether d >= e-hat(s_q), that is whether a_c is "the historical optimal action". The p_k sum to 1, so the
+    // comparison is sum_k exp(-q_k) (e_k - d) <= 0. This form is exact where it matters: if all e_k equal d, each term is
+    // 0, whereas a rounded mean of equal numbers can exceed them and would give such a pair the weight alpha. Without
+    // neighbours the sum is empty and the answer yes: nothing speaks against a_c.
     bool is_optimal(std::span<const Neighbour> found, double d) const {
         double excess = 0.0;
         for (size_t k = 0; k < found.size(); ++k) excess += similarity(found, k) * (e[found[k].entry] - d);
         return excess <= 0.0;
     }
 
-    // WODTEM eq. (7): w(s, a) = 1 if d >= e-hat(s), else alpha.
-    double weight(std::span<const Neighbour> found, double d, double alpha) const {
-        return is_optimal(found, d) ? 1.0 : alpha;
+    // WODTEM eq. (7): w(s, a) = 1 if d >= e-hat(s), else alpha. `optimal` is what is_optimal() returned.
+    static double weight(bool optimal, double alpha) { return optimal ? 1.0 : alpha; }
+
+    // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
+    // The largest e is subtracted first: e reaches thousands and exp(89) overflows a float. `uniform` lies in [0, 1); the
+    // neighbour is drawn by the inverse of the cumulative distribution. Returns the action [action_dim].
+    const float* advised_action(std::span<const Neighbour> found, double uniform) const {
+        if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to advise");
+        double best = e[found[0].entry], total = 0.0, cumulative = 0.0;
+        for (const Neighbour& neighbour : found) best = std::max(best, e[neighbour.entry]);
+        const auto odds = [&](const Neighbour& neighbour) {
+            return double{std::exp(static_cast<float>((e[neighbour.entry] - best) / config.tau))};
+        };
+        for (const Neighbour& neighbour : found) total += odds(neighbour);
+        // uniform <= 1 - 2^-53 makes uniform * total < total even when rounded, and the cumulative sum ends in total. So
+        // one neighbour is drawn, and never one of probability 0, which leaves the sum unchanged.
+        size_t k = 0;
+        for (; k + 1 < found.size(); ++k) {
+            cumulative += odds(found[k]);
+            if (cumulative > uniform * total) break;
+        }
+        return &actions[found[k].entry * A];
     }
 
-    // ---- saving, loading, size
+    // ---- saving and loading
 
     // each(name, column, numbers per entry)
     template <class Self, class Each>
@@ -1148,14 +846,5 @@ struct EpisodicMemory {
         }
         heap.clear();
         tree.build(points(), dim, static_cast<uint32_t>(n));
-    }
-
-    // Bytes of memory in use, derived state included.
-    size_t bytes() const {
-        size_t total = 0;
-        const auto add = [&](const auto& column) { total += column.capacity() * sizeof(column[0]); };
-        for_each_column(*this, [&](const char*, const auto& column, size_t) { add(column); });
-        add(projection), add(slots), add(heap);
-        return total + tree.bytes();
     }
 };

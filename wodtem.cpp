@@ -752,11 +752,11 @@ void consult_memory(const Run& run, Batch& batch) {
     batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
     for (size_t i = 0; i < batch.weights.size(); ++i) {
         const std::span<const Neighbour> found = batch.neighbours[i];
-        batch.weights[i] =
-            static_cast<float>(run.memory.weight(found, batch.discounted_returns[i], run.agent.settings.alpha));
-        if (!run.memory.is_optimal(found, batch.discounted_returns[i])) {
+        const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);
+        batch.weights[i] = static_cast<float>(run.memory.weight(optimal, run.agent.settings.alpha));
+        if (!optimal) {
             const float* action =
-                run.memory.remembered_action(found, random.uniform(run.progress.updates, batch.numbers[i]));
+                run.memory.advised_action(found, random.uniform(run.progress.updates, batch.numbers[i]));
             for (size_t j = i * action_dim; j < (i + 1) * action_dim; ++j)
                 batch.remembered[j] = run.agent.spec.moves > 0 ? *action++ : clamp_action(*action++);
         }

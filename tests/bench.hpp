@@ -7,6 +7,8 @@
 
 #include <sys/resource.h>
 
+#include "memory_bytes.hpp"
+
 double seconds_of(const std::function<void()>& work) {
     const auto begin = Console::Clock::now();
     work();
@@ -416,7 +418,7 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
         const Spread one = {spread.low / n, spread.median / n, spread.high / n};
         measured.add({group, what, one, 0, bytes, share_of(bytes / bandwidth, one)});
     };
-    constexpr double leaf = sizeof(BoxTree::Lanes<float>) * (4 + 1);  // its points, and their numbers
+    constexpr double leaf = sizeof(KdTree::Lanes<float>) * (4 + 1);  // its points, and their numbers
     add("look-up, 5000 at once", look_up, queries, leaf);
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);
@@ -424,7 +426,7 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     add("building the tree, all", {build, build, build}, 1);
     if (!measured.json)
         std::printf("  %.0f bytes an entry\n",
-                    static_cast<double>(memory.bytes()) / static_cast<double>(memory.size()));
+                    static_cast<double>(memory_bytes(memory)) / static_cast<double>(memory.size()));
 }
 
 void bench_all(const std::string& kernel_name, int threads, bool json) {

@@ -958,7 +958,7 @@ void check_memory_action(Case& c) {
     const auto uniform = c.uniform_in("uniform", {m});
     std::vector<float> actions;
     for (size_t i = 0; i < m; ++i) {
-        const float* action = table.memory.remembered_action(found[i], uniform.values[i]);
+        const float* action = table.memory.advised_action(found[i], uniform.values[i]);
         actions.insert(actions.end(), action, action + table.memory.A);
     }
     c.expect("action", {m, table.memory.A}, actions);
@@ -973,7 +973,7 @@ void check_weights(Case& c) {
     const double alpha = c.number("alpha", {}, 0, 1);
     std::vector<double> w, e_hat;
     for (size_t i = 0; i < m; ++i) {
-        w.push_back(table.memory.weight(found[i], d.values[i], alpha));
+        w.push_back(table.memory.weight(table.memory.is_optimal(found[i], d.values[i]), alpha));
         e_hat.push_back(table.memory.approximate_return(found[i]));
     }
     c.expect("w", {m}, w);
@@ -1395,9 +1395,9 @@ void check_advice(Case& c) {
         for (size_t k = i * K; k < i * K + static_cast<size_t>(count.values[i]); ++k)
             found.push_back({distance.values[k], static_cast<uint32_t>(k)});
         e_hat.push_back(memory.approximate_return(found));
-        w.push_back(memory.weight(found, d.values[i], alpha));
         const bool drawn = !memory.is_optimal(found, d.values[i]);
-        const float* action = drawn ? memory.remembered_action(found, uniform.values[i]) : nullptr;
+        w.push_back(memory.weight(!drawn, alpha));
+        const float* action = drawn ? memory.advised_action(found, uniform.values[i]) : nullptr;
         for (size_t j = 0; j < memory.A; ++j) a_hat.push_back(drawn ? action[j] : NAN);
     }
     c.expect("memory/e_hat", {n}, e_hat);

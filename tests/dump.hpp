@@ -79,10 +79,10 @@ void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vecto
             std::copy_n(&run.memory.actions[found[k].entry * A], A, &neighbour_actions[(i * K + k) * A]);
         }
         e_hat.push_back(run.memory.approximate_return(found));
-        w.push_back(run.memory.weight(found, batch.discounted_returns[i], run.agent.settings.alpha));
+        const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);
+        w.push_back(run.memory.weight(optimal, run.agent.settings.alpha));
         uniform.push_back(run.random(Stream::remembered_action).uniform(run.progress.updates, batch.numbers[i]));
-        if (!run.memory.is_optimal(found, batch.discounted_returns[i]))
-            std::copy_n(run.memory.remembered_action(found, uniform[i]), A, &a_hat[i * A]);
+        if (!optimal) std::copy_n(run.memory.advised_action(found, uniform[i]), A, &a_hat[i * A]);
     }
     dump.add("in/memory/count", {n}, count);
     dump.add("in/memory/distance", {n, K}, distance);

@@ -1,9 +1,11 @@
 // test_memory.cpp: memory.hpp against closed forms, O(T^2) definitions, linear scans and a table told a second way.
 #include <cstring>
 #include <map>
+#include <numeric>
 #include <set>
 
 #include "../memory.hpp"
+#include "memory_bytes.hpp"
 #include "test.hpp"
 
 namespace {
@@ -176,33 +178,62 @@ void compare_with_naive(const MemoryConfig& config, int operations, uint32_t sal
     }
 }
 
-// Every entry is in the tree once, every box is the exact box of what is below, every node is as full as promised.
-void check_tree(const EpisodicMemory& memory) {
-    BoxTree tree = memory.tree;
-    std::vector<int> met(memory.size());
-    const auto below = [&](const auto& self, size_t level, uint32_t node) -> size_t {  // returns the nodes met
-        const size_t n = tree.used(level, node);
-        CHECK(n >= (level < tree.top() ? tree.fewest : level > 0 ? 2 : 0));
-        size_t nodes = 1;
-        for (size_t lane = 0; lane < n; ++lane) {
-            const uint32_t child = tree.child(level, node)[lane];
-            CHECK_EQUAL(tree.levels[level].home[child], node);
-            if (level == 0) ++met.at(child);
-            for (size_t d = 0; level == 0 && d < memory.dim; ++d)
-                CHECK_EQUAL(tree.low(0, node, d)[lane], memory.projected[child * memory.dim + d]);
-            if (level > 0) {
-                CHECK(!tree.enclose(memory.points(), level, node, lane));
-                nodes += self(self, level - 1, child);
-            }
-        }
-        for (size_t lane = n; lane < tree.lanes; ++lane) CHECK_EQUAL(tree.child(level, node)[lane], no_entry);
-        return nodes;
+// The entries in the tree are `inside`, each in one lane, with its coordinates and on its side of every plane above;
+// counts, parents and homes are right, every pair of nodes and every place is used or free, and no path is too long.
+void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
+    const KdTree& tree = memory.tree;
+    std::vector<uint32_t> met, pairs = tree.free_pairs, places;
+    struct Box {
+        std::vector<float> low, high;
     };
-    size_t nodes = below(below, tree.top(), tree.root);
-    for (const BoxTree::Level& level : tree.levels) nodes += level.unused.size();
-    for (const BoxTree::Level& level : tree.levels) nodes -= level.child.size();
-    CHECK_EQUAL(nodes, size_t{0});
-    CHECK(std::all_of(met.begin(), met.end(), [](int times) { return times == 1; }));
+    const auto below = [&](const auto& self, uint32_t node, const Box& box, size_t depth) -> uint32_t {
+        const auto [child, dim, split, count] = tree.nodes[node];
+        CHECK(depth < KdTree::longest_path);
+        if (dim == KdTree::leaf) {
+            CHECK(count <= KdTree::lanes);
+            places.push_back(child);
+            for (uint32_t lane = 0; lane < count; ++lane) {
+                const uint32_t entry = tree.entries[child][lane];
+                met.push_back(entry);
+                CHECK_EQUAL(tree.home.at(entry), node);
+                for (size_t d = 0; d < memory.dim; ++d) {
+                    const float x = tree.coordinates[child * memory.dim + d][lane];
+                    CHECK_EQUAL(x, memory.projected[entry * memory.dim + d]);
+                    CHECK(box.low[d] <= x && x <= box.high[d]);
+                }
+            }
+            return count;
+        }
+        CHECK(count > KdTree::lanes / 2);
+        CHECK_EQUAL(tree.parents[child / 2], node);
+        pairs.push_back(child / 2);
+        Box low = box, high = box;
+        low.high[dim] = std::min(box.high[dim], split);
+        high.low[dim] = std::max(box.low[dim], split);
+        const uint32_t in_low = self(self, child, low, depth + 1), in_high = self(self, child + 1, high, depth + 1);
+        CHECK_EQUAL(in_low + in_high, count);
+        CHECK(4 * std::max(in_low, in_high) <=
+              3 * count + 7);  // an insertion finds it out only when the next one comes
+        return count;
+    };
+    below(below, 0, {std::vector<float>(memory.dim, -INFINITY), std::vector<float>(memory.dim, INFINITY)}, 0);
+    const auto all_below = [](std::vector<uint32_t>& numbers, size_t n, uint32_t first) {  // first .. n - 1, each once
+        std::sort(numbers.begin(), numbers.end());
+        CHECK_EQUAL(numbers.size(), n - first);
+        for (size_t i = 0; i < numbers.size(); ++i) CHECK_EQUAL(numbers[i], i + first);
+    };
+    std::sort(met.begin(), met.end());
+    std::sort(inside.begin(), inside.end());
+    CHECK(met == inside);
+    all_below(pairs, tree.parents.size(), 1);  // pair 0 holds the root
+    for (const uint32_t pair : tree.free_pairs) places.push_back(pair);
+    all_below(places, tree.parents.size(), 0);  // a free pair's place is free
+}
+
+void check_tree(const EpisodicMemory& memory) {
+    std::vector<uint32_t> inside(memory.size());
+    std::iota(inside.begin(), inside.end(), 0u);
+    check_tree(memory, inside);
 }
 
 enum class Shape { uniform, lattice, clusters, walk, line, point };
@@ -459,7 +490,7 @@ TEST(two_million_entries_fit_in_400_megabytes) {
     trajectory.rewards.resize(125001);
     relabel(trajectory, 11, 8, gamma_dr);
     CHECK_EQUAL(memory.update(trajectory).evicted, 1u);
-    CHECK(memory.bytes() * 16 > 250000000 && memory.bytes() * 16 < 370000000);
+    CHECK(memory_bytes(memory) * 16 > 250000000 && memory_bytes(memory) * 16 < 370000000);
 }
 
 // ---- Neighbours
@@ -533,6 +564,7 @@ TEST(the_tree_survives_any_order_of_coming_and_going) {
         expected.resize(std::min(expected.size(), size_t{3}));
         CHECK(same(found[0], expected));
     }
+    check_tree(memory, inside);
     for (const uint32_t entry : outside) memory.tree.insert(memory.points(), entry);
     check_tree(memory);
 }
@@ -553,7 +585,6 @@ TEST(many_equal_points_neither_break_nor_slow_the_tree) {
             CHECK(entries_of(search(memory, at)) == (std::vector<uint32_t>{oldest, oldest + 1}));
         CHECK(entries_of(search(memory, near)) == (std::vector<uint32_t>{oldest, oldest + 1}));
         check_tree(memory);
-        CHECK(memory.tree.levels.size() <= 6);  // 8^5 leaves of 8 hold more
     }
 }
 
@@ -645,29 +676,28 @@ TEST(approximate_return_weighs_by_exp_of_minus_squared_distance) {
 }
 
 // WODTEM eq. (6) test
-TEST(remembered_action_follows_the_softmax_of_returns) {
+TEST(advised_action_follows_the_softmax_of_returns) {
     EpisodicMemory memory = table_of(small(), {{0.0f, 100, 1}, {0.25f, 200, 2}});
     const float query = 0.0f;
     const auto found = search_and_count(memory, &query);
     const double first = 1.0 / (1.0 + std::exp(1.0));  // p of the entry with e = 1
-    CHECK_EQUAL(*memory.remembered_action(found, 0.0), 100.0f);
-    CHECK_EQUAL(*memory.remembered_action(found, first - 1e-6), 100.0f);
-    CHECK_EQUAL(*memory.remembered_action(found, first + 1e-6), 200.0f);
-    CHECK_EQUAL(*memory.remembered_action(found, 1.0 - 0x1p-53), 200.0f);
+    CHECK_EQUAL(*memory.advised_action(found, 0.0), 100.0f);
+    CHECK_EQUAL(*memory.advised_action(found, first - 1e-6), 100.0f);
+    CHECK_EQUAL(*memory.advised_action(found, first + 1e-6), 200.0f);
+    CHECK_EQUAL(*memory.advised_action(found, 1.0 - 0x1p-53), 200.0f);
     memory.config.tau = 0.5;
     const double colder = 1.0 / (1.0 + std::exp(2.0));
-    CHECK_EQUAL(*memory.remembered_action(found, colder - 1e-6), 100.0f);
-    CHECK_EQUAL(*memory.remembered_action(found, colder + 1e-6), 200.0f);
-    CHECK_FAILS("memory.no_neighbours", memory.remembered_action({}, 0.5));
+    CHECK_EQUAL(*memory.advised_action(found, colder - 1e-6), 100.0f);
+    CHECK_EQUAL(*memory.advised_action(found, colder + 1e-6), 200.0f);
+    CHECK_FAILS("memory.no_neighbours", memory.advised_action({}, 0.5));
 }
 
-TEST(remembered_action_survives_large_returns_and_never_draws_probability_zero) {
+TEST(advised_action_survives_large_returns_and_never_draws_probability_zero) {
     EpisodicMemory memory = table_of(small(), {{0.0f, 100, 0}, {0.25f, 200, 3000}, {0.5f, 300, -3000}});
     const std::vector<Neighbour> found = {{0, 0}, {0, 1}, {0, 2}};
-    for (const double uniform : {0.0, 0.5, 1.0 - 0x1p-53})
-        CHECK_EQUAL(*memory.remembered_action(found, uniform), 200.0f);
+    for (const double uniform : {0.0, 0.5, 1.0 - 0x1p-53}) CHECK_EQUAL(*memory.advised_action(found, uniform), 200.0f);
     const std::vector<Neighbour> equal(7, Neighbour{0, 1});
-    CHECK_EQUAL(*memory.remembered_action(equal, 1.0 - 0x1p-53), 200.0f);
+    CHECK_EQUAL(*memory.advised_action(equal, 1.0 - 0x1p-53), 200.0f);
 }
 
 // WODTEM eq. (7) test
@@ -676,16 +706,16 @@ TEST(weight_is_alpha_only_below_the_approximate_return) {
     const double e = memory.e[0];
     const std::vector<Neighbour> lone = {{0, 0}}, two = {{0.0f, 0}, {0.09f, 1}}, far = {{0.0f, 0}, {0.25f, 2}};
     for (const auto& found : {lone, two}) {
-        CHECK_EQUAL(memory.weight(found, e, 0.9), 1.0);  // equal, whatever the rounding of the mean
-        CHECK_EQUAL(memory.weight(found, std::nextafter(e, 1.0), 0.9), 1.0);
-        CHECK_EQUAL(memory.weight(found, std::nextafter(e, 0.0), 0.9), 0.9);
+        CHECK_EQUAL(memory.weight(memory.is_optimal(found, e), 0.9), 1.0);  // equal, whatever the rounding of the mean
+        CHECK_EQUAL(memory.weight(memory.is_optimal(found, std::nextafter(e, 1.0)), 0.9), 1.0);
+        CHECK_EQUAL(memory.weight(memory.is_optimal(found, std::nextafter(e, 0.0)), 0.9), 0.9);
     }
     const double mean = memory.approximate_return(far);
-    CHECK_EQUAL(memory.weight(far, mean + 1e-9, 0.75), 1.0);
-    CHECK_EQUAL(memory.weight(far, mean - 1e-9, 0.75), 0.75);
-    CHECK_EQUAL(memory.weight(lone, 0.0, 0.0), 0.0);
-    CHECK_EQUAL(memory.weight(lone, 0.0, 1.0), 1.0);
-    CHECK_EQUAL(memory.weight({}, -1e9, 0.9), 1.0);  // no neighbours: plain ODT
+    CHECK_EQUAL(memory.weight(memory.is_optimal(far, mean + 1e-9), 0.75), 1.0);
+    CHECK_EQUAL(memory.weight(memory.is_optimal(far, mean - 1e-9), 0.75), 0.75);
+    CHECK_EQUAL(memory.weight(memory.is_optimal(lone, 0.0), 0.0), 0.0);
+    CHECK_EQUAL(memory.weight(memory.is_optimal(lone, 0.0), 1.0), 1.0);
+    CHECK_EQUAL(memory.weight(memory.is_optimal({}, -1e9), 0.9), 1.0);  // no neighbours: plain ODT
 }
 
 // ---- Saving and loading
