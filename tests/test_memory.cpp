@@ -536,6 +536,31 @@ TEST(the_tree_finds_what_a_linear_scan_finds) {
         }
 }
 
+// Every distance is tied with hundreds of others: the points of a one-hot grid world, each many times over, differ from
+// a one-hot query by 0 or 2. The unprojected last coordinate tells the states apart but not the points.
+TEST(the_tree_breaks_hundreds_of_ties_by_age) {
+    const Random random{test_seed(), Stream::data_set};
+    for (const int K : {1, 7, 500, 1000}) {
+        EpisodicMemory memory({.state_dim = 37,
+                               .action_dim = 1,
+                               .projected_dim = 36,
+                               .capacity = 2500,
+                               .K = K,
+                               .epsilon = K == 7 ? 2.0 : 3.0},
+                              1);
+        std::fill(memory.projection.begin(), memory.projection.end(), 0.0);
+        for (size_t d = 0; d < 36; ++d) memory.projection[d * 37 + d] = 1.0;
+        for (uint64_t i = 0; i < 4000; ++i) {  // the last 1,500 evict
+            std::vector<float> state(37, 0.0f);
+            state[random.below(36, i, 0)] = 1.0f;
+            state[36] = static_cast<float>(i);
+            memory.update(one_step(state, 0.0f, 0.0f));
+        }
+        check_tree(memory);
+        compare_with_plain(memory, static_cast<uint64_t>(K));
+    }
+}
+
 TEST(the_tree_survives_any_order_of_coming_and_going) {
     const Random random{test_seed(), Stream::data_set};
     EpisodicMemory memory(
