@@ -25,6 +25,17 @@
 
 #include "nn.hpp"
 
+// The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
+namespace Stream {
+constexpr uint32_t batch = 3;              // step: update; index: window of the batch
+constexpr uint32_t exploration = 4;        // step: episode; site: action dimension; index: time-step
+constexpr uint32_t remembered_action = 5;  // eq. (6). step: update; index: window * context_length + step in the window
+constexpr uint32_t entropy_noise = 6;      // the same; site: action dimension
+constexpr uint32_t environment = 7;  // step: episode (evaluations from 2^40, data sets from 2^41); index: draw in reset
+constexpr uint32_t projection = 8;   // step: 0; index: element of the random projection
+constexpr uint32_t data_set = 9;     // step: trajectory; index: time-step; site: action dimension
+}  // namespace Stream
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Trajectories and their returns. T is the number of steps, t counts from 1 in the paper and from 0 in arrays.
 

@@ -33,16 +33,13 @@
 #include <vector>
 
 #if defined(__x86_64__) && !defined(__clang__)
-#define X86_KERNELS  // in AVX2, AVX-512 and AMX, beside the portable ones
-#include <cpuid.h>   // whether there is a matrix unit, and to ask for it
-#include <sys/syscall.h>
-#include <unistd.h>
+#define X86_KERNELS  // in AVX2 and AVX-512, beside the portable one
 #endif
 #define ALWAYS_INLINE [[gnu::always_inline]] inline
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Errors. Every failure is one sentence for the person at the terminal (what, where, expected and got, what to do) and
-// one stable id for tests ("safetensors.truncated"). main() prints the sentence and exits with 1, or 2 for "usage.*".
+// one stable id ("safetensors.truncated"), by which tests and callers know it.
 
 struct Error : std::runtime_error {
     std::string id;
@@ -148,35 +145,27 @@ inline const auto philox_16 = wide_vectors ? philox_16_avx512 : philox_16_plain;
 inline const auto philox_16 = philox_16_plain;
 #endif
 
-// Each use of chance has its own stream: switching one feature on or off moves no other's numbers. The values are part
-// of the format of a run (a porter needs them); never renumber.
-enum class Stream : uint32_t {
-    initialisation = 1,  // step: tensor number; index: element
-    dropout = 2,  // step: update; site: place in the network + 2^20 times the part of the batch; index: element / 4,
-                  // counted row by row; attention weights count as [query, head, longest sequence of the part]
-    batch = 3,    // step: update; index: window of the batch
-    exploration = 4,        // step: episode; site: action dimension; index: time-step
-    remembered_action = 5,  // eq. (6). step: update; index: window * context_length + step within the window
-    entropy_noise = 6,      // the same; site: action dimension
-    environment = 7,  // step: episode (evaluations count from 2^40, data sets from 2^41); index: draw in the reset
-    projection = 8,   // step: 0; index: element of the random projection
-    data_set = 9,     // step: trajectory; index: time-step; site: action dimension
-};
+// Each use of chance has a stream of its own: switching one feature on or off moves no other's numbers. The values are
+// part of the format of a run; never renumber. The streams of reinforcement learning are in memory.hpp.
+namespace Stream {
+constexpr uint32_t initialisation = 1;  // step: tensor number; index: element
+constexpr uint32_t dropout = 2;  // step: update; site: place in the network + 2^20 times the part of the batch; index:
+                                 // element / 4, counted row by row; attention weights count as
+                                 // [query, head, longest sequence of the part]
+}  // namespace Stream
 
 struct Random {
     uint32_t seed;
-    Stream stream;
+    uint32_t stream;
 
     // 128 random bits. Counter = (index, site, step low, step high), key = (seed, stream).
     Words4 words(uint64_t step, uint32_t index, uint32_t site = 0) const {
-        return philox({index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed,
-                      static_cast<uint32_t>(stream));
+        return philox({index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed, stream);
     }
 
     // The words of `index` to `index` + 15, one after the other.
     void words_16(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
-        philox_16(words, {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed,
-                  static_cast<uint32_t>(stream));
+        philox_16(words, {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed, stream);
     }
 
     // Uniform in [0, 1), a multiple of 2^-53.
@@ -215,7 +204,7 @@ class Threads {
             for (int worker = 1; worker < count; ++worker) workers_.emplace_back([this, worker] { work(worker); });
         } catch (const std::system_error& error) {
             stop();
-            fail("nn.threads", "cannot start %d threads: %s; use fewer (--threads)", count, error.what());
+            fail("nn.threads", "cannot start %d threads: %s; use fewer", count, error.what());
         }
     }
     ~Threads() { stop(); }
@@ -335,45 +324,10 @@ void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int
         }
 }
 
-// Matrix units multiply bf16, the upper half of a float. A float is the sum of bf16 parts, x = x_0 + x_1 + x_2, each
-// the nearest bf16 to what those before it leave over; a product is the sum of the products of parts i, j with i + j <
-// parts: one (`bf16`, relative error 2^-8), three of two parts each (`bf16x3`, 2^-16), or six of three (`bf16x6`, as
-// exact as float). The definition, for the order of additions: C takes in 32 k at a time, for these the products of
-// parts in turn, of each the sum over even k and the sum over odd k, added up from zero in order of k.
-inline float bf16_nearest(float x) {  // ties to even; infinity and the NaN that arithmetic makes stay what they are
-    const uint32_t bits = std::bit_cast<uint32_t>(x);
-    return std::bit_cast<float>((bits + (bits >> 16 & 1) + 0x7FFF) & 0xFFFF0000);
-}
-
-// Part j of B that meets part i of A in turn n < parts - i: back and forth, small products first, so that most turns
-// find their part of B loaded.
-constexpr int part_of_b(int parts, int i, int n) { return i % 2 == 0 ? parts - 1 - i - n : n; }
-
-inline void matmul_parts_plain(View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
-                               Store store, int parts) {
-    const auto part = [](float x, int i) {
-        for (; i > 0; --i) x -= bf16_nearest(x);
-        return bf16_nearest(x);
-    };
-    for (int row = 0; row < M; ++row)
-        for (int column = 0; column < N; ++column) {
-            if (store == Store::overwrite) c(row, column) = 0;
-            for (int first = 0; first < K; first += 32)
-                for (int i = 0; i < parts; ++i)
-                    for (int n = 0; n < parts - i; ++n) {
-                        const int j = part_of_b(parts, i, n);
-                        float sums[2] = {};  // over even k and over odd k
-                        for (int k = first; k < std::min(K, first + 32); ++k)
-                            sums[k % 2] += part(a(row, k), i) * part(b(k, column), j);  // an exact product
-                        c(row, column) += sums[0] + sums[1];
-                    }
-        }
-}
-
 // ---------------------------------------------------------------------------------------------------------------------
-// Kernels. What computes one tile of a product, for each instruction set and precision.
+// Kernels. What computes one tile of a product, for each instruction set.
 
-// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns], depth <= kernel.depth. Writes (`add`:
+// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns], depth <= sum_block. Writes (`add`:
 // adds) the upper left rows x columns of the tile to c.
 using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int depth, int rows, int columns,
                               bool add);
@@ -382,23 +336,20 @@ using TileFunction = void (*)(float* c, int c_stride, const void* a, const void*
 // view(k, w) offset by (first_k, first_w). Lines are rows of A or columns of B.
 using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_w, int depth, int used);
 
-// What a kernel must offer.
+// One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone: the
+// packed panels are opaque to it, so a kernel may store its elements in another format (bf16, say) by its own packing.
 struct Kernel {
-    const char *name, *precision;
-    const char* arithmetic;  // kernels of equal arithmetic give the same bits: "fused" multiply-add with one rounding,
-                             // "plain" with two (these are matmul_plain's), or the precision (matmul_parts_plain's)
-    int parts;               // bf16 parts of a float; 0: floats
+    const char* name;
+    // Kernels of equal arithmetic give the same bits: "fused" rounds once for a multiply-add, "plain" twice, as
+    // matmul_plain does.
+    const char* arithmetic;
     int tile_rows, tile_columns;
-    bool (*supported)();
+    size_t element_bytes;  // of one element in a panel
+    bool (*supported)();   // by this machine
     PackFunction pack_a, pack_b;
     TileFunction tile;
-    void (*prepare)(bool begin);  // called before and after a thread works on tiles
-    // k at a time: as the definition has it for floats; for parts C takes in what comes, and panels of 32 kB are best.
-    int depth() const { return parts > 0 ? 512 / parts / 32 * 32 : sum_block; }
-    size_t panel_bytes(int width, int k) const {
-        const int elements = width * (parts > 0 ? (k + 31) / 32 * 32 : k);
-        return static_cast<size_t>(elements) * (parts > 0 ? 2 * static_cast<size_t>(parts) : sizeof(float));
-    }
+    // Bytes of panels of `lines` lines in all, `depth` elements each.
+    size_t panel_bytes(int lines, int depth) const { return element_bytes * lines * depth; }
 };
 
 typedef float Float4 __attribute__((vector_size(16)));
@@ -512,250 +463,33 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_w, int
 template <int Rows, int Columns>
 constexpr Kernel vector_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
     const PackFunction pack_a = pack_floats<Rows>, pack_b = pack_floats<Columns>;
-    return {name, "fp32", arithmetic, 0, Rows, Columns, supported, pack_a, pack_b, tile, [](bool) {}};
+    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_a, pack_b, tile};
 }
 
-// Panels of parts, for tiles of 32 x 32: for each 32 k and each part, twice (16 lines each) a matrix of 16 x 16 pairs
-// (k, k + 1): [line][pair] for A and [pair][line] for B, as AMX takes them.
-constexpr int part_lines = 32, part_size = 32 * part_lines;
-
-// Two times 16 floats to 16 pairs of parts, the parts of a pair `stride` elements apart. Interleaved: pair i is
-// (x[i], y[i]); else the pairs are (x[0], x[1]), ..., (y[14], y[15]).
-template <int Parts>
-ALWAYS_INLINE void split_pairs(uint16_t* to, const float* x, const float* y, ptrdiff_t stride, bool interleaved) {
-    typedef uint32_t Words __attribute__((vector_size(64)));
-    typedef uint16_t Halves __attribute__((vector_size(32)));
-    Float16 rest[2];
-    std::memcpy(&rest[0], x, sizeof rest[0]);
-    std::memcpy(&rest[1], y, sizeof rest[1]);
-#pragma GCC unroll 3
-    for (int part = 0; part < Parts; ++part, to += stride) {
-        Words top[2];
-        for (int i = 0; i < 2; ++i) {  // bf16_nearest
-            top[i] = Words(rest[i]) + (Words(rest[i]) >> 16 & 1) + 0x7FFF;
-            rest[i] -= Float16(top[i] & 0xFFFF0000);
-        }
-        const Words both = top[0] >> 16 | (top[1] & 0xFFFF0000);
-        if (interleaved) std::memcpy(to, &both, sizeof both);
-        for (int i = 0; !interleaved && i < 2; ++i) {
-            const Halves half = __builtin_convertvector(top[i] >> 16, Halves);
-            std::memcpy(to + 16 * i, &half, sizeof half);
-        }
-    }
-}
-
-// PackFunction for parts. A row of 16 pairs comes from 32 k of a line, or from 16 lines of two k, as they lie in
-// memory; where the panel wants it the other way round, 16 x 16 pairs are turned.
-template <int Parts, bool OfB, bool AlongK>
-ALWAYS_INLINE void pack_parts_of(uint16_t* panel, View<const float> view, int first_k, int first_w, int depth,
-                                 int used) {
-    constexpr bool turn = AlongK == OfB;
-    alignas(64) uint16_t block[Parts * 512];
-    for (int k = 0; k < depth; k += 32, panel += Parts * part_size)
-        for (int w = 0; w < part_lines; w += 16) {
-            const bool whole = depth - k >= 32 && used - w >= 16;
-            for (int row = 0; row < 16; ++row) {
-                const int at_k = AlongK ? k : k + 2 * row, at_w = AlongK ? w + row : w;
-                float edge[32] = {};
-                const float *x = edge, *y = edge + 16;
-                if (whole) {
-                    x = &view(first_k + at_k, first_w + at_w);
-                    y = AlongK ? x + 16 : x + view.stride;
-                    // Two turns of k ahead, or a panel: 16 lines at once are too many for the processor to foresee.
-                    const ptrdiff_t ahead = AlongK ? 64 : 32;
-                    __builtin_prefetch(x + ahead), __builtin_prefetch(y + ahead);
-                } else {
-                    for (int i = 0; i < 32; ++i) {
-                        const int some_k = AlongK ? k + i : at_k + i / 16, some_w = AlongK ? at_w : w + i % 16;
-                        if (some_k < depth && some_w < used) edge[i] = view(first_k + some_k, first_w + some_w);
-                    }
-                }
-                split_pairs<Parts>((turn ? block : panel + 32 * w) + 32 * row, x, y, turn ? 512 : part_size, !AlongK);
-            }
-            for (int part = 0; turn && part < Parts; ++part)
-                for (int i = 0; i < 16; i += 4)
-                    for (int j = 0; j < 16; j += 4)
-                        turn_4x4(reinterpret_cast<float*>(panel + part * part_size + 32 * w + 32 * j + 2 * i), 16,
-                                 reinterpret_cast<const float*>(block + part * 512 + 32 * i + 2 * j), 16);
-        }
-}
-
-template <int Parts, bool OfB>
-EACH_TARGET void pack_parts(void* panel, View<const float> view, int first_k, int first_w, int depth, int used) {
-    uint16_t* to = static_cast<uint16_t*>(panel);
-    if (view.transposed) return pack_parts_of<Parts, OfB, true>(to, view, first_k, first_w, depth, used);
-    pack_parts_of<Parts, OfB, false>(to, view, first_k, first_w, depth, used);
-}
-
-// What AMX does, in C++: a tile of C and 32 k of A and B, the definition's inner loop (Intel's manual on TDPBF16PS; AMX
-// takes subnormal numbers for zero).
-struct TilesInSoftware {
-    float c[32][32];
-    const uint16_t *a = nullptr, *b = nullptr;
-    static void prepare(bool) {}
-    void clear() { std::memset(c, 0, sizeof c); }
-    void load_c(const float* from, ptrdiff_t stride) {
-        for (int row = 0; row < 32; ++row) std::copy_n(from + row * stride, 32, c[row]);
-    }
-    void store_c(float* to, ptrdiff_t stride) const {
-        for (int row = 0; row < 32; ++row) std::copy_n(c[row], 32, to + row * stride);
-    }
-    void load_a(const uint16_t* from) { a = from; }
-    void load_b(const uint16_t* from) { b = from; }
-    void multiply() {
-        const auto widened = [](uint16_t part) { return std::bit_cast<float>(uint32_t{part} << 16); };
-        for (int row = 0; row < 32; ++row)
-            for (int half = 0; half < 2; ++half) {
-                float sums[32] = {};  // of even and odd k by turns
-                for (int pair = 0; pair < 16; ++pair)
-                    for (int j = 0; j < 32; ++j)
-                        sums[j] += widened(a[32 * row + 2 * pair + j % 2]) * widened(b[512 * half + 32 * pair + j]);
-                for (int j = 0; j < 16; ++j) c[row][16 * half + j] += sums[2 * j] + sums[2 * j + 1];
-            }
-    }
-};
-
-#ifdef X86_KERNELS
-// The matrix unit itself. Every instruction says that it may read and write memory, so the compiler keeps their order.
-struct TilesInAmx {
-    static void prepare(bool begin) {
-        static constexpr struct alignas(64) {  // palette 1: all eight tiles have 16 rows of 64 bytes
-            uint8_t palette = 1, start_row = 0, reserved[14] = {};
-            uint16_t row_bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
-            uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
-        } shape;
-        if (begin)
-            asm volatile("ldtilecfg %0" ::"m"(shape) : "memory");
-        else
-            asm volatile("tilerelease" ::: "memory");
-    }
-    static void clear() {
-        asm volatile("tilezero %%tmm0\ntilezero %%tmm1\ntilezero %%tmm2\ntilezero %%tmm3" ::: "memory");
-    }
-    static void load_c(const float* from, ptrdiff_t stride) {
-        asm volatile(
-            "tileloadd (%0,%2,1), %%tmm0\ntileloadd 64(%0,%2,1), %%tmm1\n"
-            "tileloadd (%1,%2,1), %%tmm2\ntileloadd 64(%1,%2,1), %%tmm3" ::"r"(from),
-            "r"(from + 16 * stride), "r"(4 * stride)
-            : "memory");
-    }
-    static void store_c(float* to, ptrdiff_t stride) {
-        asm volatile(
-            "tilestored %%tmm0, (%0,%2,1)\ntilestored %%tmm1, 64(%0,%2,1)\n"
-            "tilestored %%tmm2, (%1,%2,1)\ntilestored %%tmm3, 64(%1,%2,1)" ::"r"(to),
-            "r"(to + 16 * stride), "r"(4 * stride)
-            : "memory");
-    }
-    static void load_a(const uint16_t* from) {
-        asm volatile("tileloadd (%0,%1,1), %%tmm4\ntileloadd 1024(%0,%1,1), %%tmm5" ::"r"(from), "r"(ptrdiff_t{64})
-                     : "memory");
-    }
-    static void load_b(const uint16_t* from) {
-        asm volatile("tileloadd (%0,%1,1), %%tmm6\ntileloadd 1024(%0,%1,1), %%tmm7" ::"r"(from), "r"(ptrdiff_t{64})
-                     : "memory");
-    }
-    static void multiply() {
-        asm volatile(
-            "tdpbf16ps %%tmm6, %%tmm4, %%tmm0\ntdpbf16ps %%tmm7, %%tmm4, %%tmm1\n"
-            "tdpbf16ps %%tmm6, %%tmm5, %%tmm2\ntdpbf16ps %%tmm7, %%tmm5, %%tmm3" ::
-                : "memory");
-    }
-};
-
-// Whether the processor has it, the kernel saves its registers, and lets this process use it (Linux: a request).
-inline bool amx_granted() {
-    static const bool granted = [] {
-        unsigned a, b, c, d, low, high;
-        if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (d >> 22 & 1) == 0 || (d >> 24 & 1) == 0) return false;
-        if (!__builtin_cpu_supports("avx512f")) return false;  // which also says that XGETBV is there
-        asm volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
-        constexpr int request_permission = 0x1023, tile_data = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
-        if ((low >> 17 & 3) == 3 && syscall(SYS_arch_prctl, request_permission, tile_data) == 0) return true;
-        std::fprintf(stderr, "wodtem: the system does not grant the use of the matrix unit (AMX); going on without\n");
-        return false;
-    }();
-    return granted;
-}
-#endif
-
-template <class Tiles, int Parts>
-void tile_of_parts(float* c, int c_stride, const void* a_panel, const void* b_panel, int depth, int rows, int columns,
-                   bool add) {
-    const uint16_t *a = static_cast<const uint16_t*>(a_panel), *b = static_cast<const uint16_t*>(b_panel);
-    alignas(64) float whole[part_lines * part_lines];  // where the tile sticks out of C
-    const bool inside = rows == part_lines && columns == part_lines;
-    for (int row = 0; add && !inside && row < rows; ++row)
-        std::copy_n(c + static_cast<ptrdiff_t>(row) * c_stride, columns, whole + row * part_lines);
-    Tiles tiles;
-    if (add)
-        tiles.load_c(inside ? c : whole, inside ? c_stride : part_lines);
-    else
-        tiles.clear();
-    for (int k = 0; k < depth; k += 32, a += Parts * part_size, b += Parts * part_size)
-#pragma GCC unroll 3
-        for (int i = 0, loaded = -1; i < Parts; ++i) {
-            tiles.load_a(a + i * part_size);
-#pragma GCC unroll 3
-            for (int n = 0; n < Parts - i; ++n) {
-                const int j = part_of_b(Parts, i, n);
-                if (j != loaded) tiles.load_b(b + j * part_size);
-                loaded = j;
-                tiles.multiply();
-            }
-        }
-    tiles.store_c(inside ? c : whole, inside ? c_stride : part_lines);
-    for (int row = 0; !inside && row < rows; ++row)
-        std::copy_n(whole + row * part_lines, columns, c + static_cast<ptrdiff_t>(row) * c_stride);
-}
-
-template <class Tiles, int Parts>
-constexpr Kernel tile_kernel(const char* name, const char* precision, const char* arithmetic, bool (*supported)()) {
-    const PackFunction pack_a = pack_parts<Parts, false>, pack_b = pack_parts<Parts, true>;
-    const TileFunction tile = tile_of_parts<Tiles, Parts>;
-    return {name, precision, arithmetic, Parts, 32, 32, supported, pack_a, pack_b, tile, Tiles::prepare};
-}
-
-inline bool everywhere() { return true; }
-#define PARTS(NAME, TILES, FP32, SUPPORTED)                                                          \
-    inline const Kernel NAME##_bf16x6 = tile_kernel<TILES, 3>(#NAME, FP32, "bf16x6", SUPPORTED),     \
-                        NAME##_bf16x3 = tile_kernel<TILES, 2>(#NAME, "bf16x3", "bf16x3", SUPPORTED), \
-                        NAME##_bf16 = tile_kernel<TILES, 1>(#NAME, "bf16", "bf16", SUPPORTED);
-PARTS(portable, TilesInSoftware, "bf16x6", everywhere)
 #ifdef X86_KERNELS
 KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
 KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
        __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-PARTS(amx, TilesInAmx, "fp32", amx_granted)
 #endif
 KERNEL(portable, , Float4, 4, 2, false, true)
 
-// Best first.
+// All kernels of this program, best first. A kernel of reduced precision would stand here as one more record.
 inline const Kernel* const kernels[] = {
 #ifdef X86_KERNELS
-    &amx_bf16x6,      &amx_bf16x3,      &amx_bf16,        &kernel_avx512, &kernel_avx2,
+    &kernel_avx512, &kernel_avx2,
 #endif
-    &kernel_portable, &portable_bf16x6, &portable_bf16x3, &portable_bf16};
+    &kernel_portable};
 
-// By name ("auto": the best for the precision that is no imitation in software). Errors: usage.kernel, usage.precision.
-inline const Kernel& choose_kernel(const std::string& name, const std::string& precision = "fp32") {
-    std::string available;
-    bool named = name == "auto", precise = false;
-    for (const Kernel* kernel : kernels) {
-        const bool imitation = kernel->parts > 0 && std::strcmp(kernel->name, "portable") == 0,
-                   fits = precision == kernel->precision || precision == kernel->arithmetic;
-        named = named || name == kernel->name;
-        precise = precise || fits;
-        if (!kernel->supported()) continue;
-        if (fits && (name == kernel->name || (name == "auto" && !imitation))) return *kernel;
-        available += std::string(available.empty() ? "" : ", ") + kernel->name + " " + kernel->precision;
-    }
-    if (!named)
-        fail("usage.kernel", "unknown kernel \"%s\"; this machine has: %s (or auto)", name.c_str(), available.c_str());
-    if (!precise)
-        fail("usage.precision", "unknown precision \"%s\"; this machine has: %s", precision.c_str(), available.c_str());
-    fail(name == "auto" ? "usage.precision" : "usage.kernel",
-         "this machine cannot compute in %s with kernel %s; it has: %s (portable imitates a matrix unit, slowly)",
-         precision.c_str(), name.c_str(), available.c_str());
+// The fastest kernel that this machine supports.
+inline const Kernel& best_kernel() {
+    return **std::find_if(std::begin(kernels), std::end(kernels), [](const Kernel* k) { return k->supported(); });
+}
+
+// The kernel of this name, or null if there is none or this machine does not support it.
+inline const Kernel* find_kernel(const std::string& name) {
+    for (const Kernel* kernel : kernels)
+        if (name == kernel->name && kernel->supported()) return kernel;
+    return nullptr;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -815,7 +549,7 @@ struct Block {
 };
 
 // Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along
-// the lines where these run along memory, else 32 k (what parts are packed by) of all panels at a time, which lie side
+// the lines where these run along memory, else 32 k of all panels at a time, which lie side
 // by side.
 inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char* to, View<const float> view,
                         int first_k, int depth, int first_line, int end_line) {
@@ -830,24 +564,22 @@ inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char
 // The product of a block of rows with panels of B, for one step of k.
 inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a,
                          const char* packed_b, const Block& block, int first_k, int depth, bool add) {
-    char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, kernel.depth()));
+    char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, sum_block));
     const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
     pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
                 block.end_row);
-    kernel.prepare(true);
     for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns)
         for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows)
             kernel.tile(&c(i, j), c.stride, packed_a + kernel.panel_bytes(i - block.first_row, depth),
                         packed_b + kernel.panel_bytes(j, depth), depth, std::min(kernel.tile_rows, block.end_row - i),
                         std::min(kernel.tile_columns, block.end_column - j), add);
-    kernel.prepare(false);
 }
 
 struct Nothing {
     void operator()(const Block&) const {}
 };
 
-// The fast version of matmul_plain and matmul_parts_plain: same definition, panels packed for the kernel's tiles.
+// The fast version of matmul_plain: same definition, panels packed for the kernel's tiles.
 // after(block) is called for every part of C after its last addition, while it is in a core's cache.
 template <class After = Nothing>
 void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
@@ -865,25 +597,24 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
               row_blocks = std::min(tiles, divide_up(fewest, compute.threads.count()) * compute.threads.count());
     const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
     // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
-    const int depth = kernel.depth();
-    const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, depth));
+    const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, sum_block));
     Compute::Kept* const kept =
         b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.stride, b.transposed, K, N}] : nullptr;
-    const int all_steps = divide_up(K, depth), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
+    const int all_steps = divide_up(K, sum_block), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
               steps = kept ? all_steps : std::clamp(fitting, 1, all_steps);
     Buffer& buffer = kept ? kept->packed : compute.packed_b;
     char* const packed = buffer.room(step_bytes * static_cast<size_t>(steps));
     const bool packed_before = kept && std::exchange(kept->period, compute.period) == compute.period;
     const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
-    for (int first_k = 0; first_k < K; first_k += steps * depth) {
-        const int end_k = std::min(K, first_k + steps * depth);
-        const auto depth_at = [&](int k) { return std::min(depth, end_k - k); };
+    for (int first_k = 0; first_k < K; first_k += steps * sum_block) {
+        const int end_k = std::min(K, first_k + steps * sum_block);
+        const auto depth_at = [&](int k) { return std::min(sum_block, end_k - k); };
         const int at_once = std::max(1, panels / 8), batches = divide_up(panels, at_once);  // panels that a task packs
         if (!packed_before)
             compute.threads.run(
-                divide_up(end_k - first_k, depth) * batches,
+                divide_up(end_k - first_k, sum_block) * batches,
                 [&](int task, int) {
-                    const int step = task / batches, k = first_k + step * depth,
+                    const int step = task / batches, k = first_k + step * sum_block,
                               first = task % batches * at_once * kernel.tile_columns;
                     pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
                                 packed_b(step) + kernel.panel_bytes(first, depth_at(k)), b, k, depth_at(k), first,
@@ -899,9 +630,9 @@ void matmul(Compute& compute, View<float> c, View<const float> a, View<const flo
                     return std::min(N, panels * n / column_blocks * kernel.tile_columns);
                 };
                 const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
-                for (int k = first_k; k < end_k; k += depth)
+                for (int k = first_k; k < end_k; k += sum_block)
                     matmul_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a,
-                                 packed_b((k - first_k) / depth), block, k, depth_at(k),
+                                 packed_b((k - first_k) / sum_block), block, k, depth_at(k),
                                  k > 0 || store == Store::accumulate);
                 if (end_k == K) after(block);
             },

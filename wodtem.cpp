@@ -91,8 +91,7 @@ inline const SettingRow setting_rows[] = {
     {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
     {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
     {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
-    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain|bf16x6|bf16x3|bf16",
-     "the kernel: multiply-add with one rounding or two, or sums of products of bf16 parts"},
+    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
     {"physics", &Settings::physics, 0, 0, "none|d4rl|2.2", "the task has no bodies"},
     {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
     {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
@@ -460,7 +459,7 @@ void require_same_settings(const Settings& found, const Settings& wanted, const 
         const bool kernel = std::string(row.name) == "arithmetic";
         fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
              row.name, was.c_str(), now.c_str(),
-             kernel ? "choose the kernel and precision it was begun with (--kernel, --precision)"
+             kernel ? "choose the kernel it was begun with (--kernel)"
                     : "choose another folder with --out, or the same settings");
     }
 }
@@ -646,7 +645,7 @@ struct Run {
         acting.recording = false;  // and so no dropout
     }
 
-    Random random(Stream stream) const { return {static_cast<uint32_t>(agent.settings.seed), stream}; }
+    Random random(uint32_t stream) const { return {static_cast<uint32_t>(agent.settings.seed), stream}; }
     bool remembers() const { return agent.settings.method == "wodtem"; }
     bool constrains_entropy() const { return agent.settings.method != "dt"; }
 };
@@ -1948,9 +1947,7 @@ const Option set_option = {"--set", "NAME=VALUE", "",
 const Option dataset_option = {"--dataset", "FILE", "",
                                "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"};
 const Option kernel_option = {"--kernel", "NAME", "auto",
-                              "matrix kernel: amx, avx512, avx2, portable, or the best there is"};
-const Option precision_option = {"--precision", "NAME", "fp32",
-                                 "of matrix products: fp32, bf16x3 (error 2^-16) or bf16 (2^-8)"};
+                              "matrix kernel: avx512, avx2, portable, or the best there is"};
 const Option threads_option = {"--threads", "N", "0", "worker threads; 0: one per core; results do not depend on it"};
 
 // Errors: usage.number.
@@ -1989,6 +1986,20 @@ int thread_count(const Arguments& arguments) {
     return asked > 0 ? static_cast<int>(asked) : static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
 }
 
+// The kernel of that name ("auto": the best one). `arithmetic`: for "auto", the best one of this arithmetic.
+// Errors: usage.kernel, with the names of what this machine has.
+const Kernel& kernel_named(const std::string& name, const std::string& arithmetic = "") {
+    std::string available;
+    for (const Kernel* kernel : kernels) {
+        if (!kernel->supported()) continue;
+        if (name == kernel->name) return *kernel;
+        if (name == "auto" && (arithmetic.empty() || arithmetic == kernel->arithmetic)) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name;
+    }
+    fail("usage.kernel", "this machine has no kernel \"%s\"%s; it has: %s (or auto)", name.c_str(),
+         arithmetic.empty() ? "" : (" of arithmetic " + arithmetic).c_str(), available.c_str());
+}
+
 // `given`: a file; "random": none, ten episodes of random actions and the online phase alone; "": the file of the task's
 // id, where there is one by that name. Errors: dataset.missing.
 void choose_data_set(Settings& settings, const std::string& given) {
@@ -2004,16 +2015,6 @@ void choose_data_set(Settings& settings, const std::string& given) {
     settings.dataset = fs::path(settings.dataset_path).filename();
     const bool original = published && settings.dataset_sha256 == published->sha256;
     settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
-}
-
-// A choice by rule, so that a run's bits do not depend on a moment's load: where there is a matrix unit, it computes fp32
-// products as bf16x6, but for networks that would leave most of its 32 x 32 tiles empty.
-const Kernel& asked_kernel(const Arguments& arguments, const Settings& settings) {
-    const std::string name = arguments["--kernel"], precision = arguments["--precision"];
-    if (name == "auto" && precision == "fp32" && settings.width < 128)
-        for (const Kernel* kernel : kernels)
-            if (kernel->parts == 0 && kernel->supported()) return *kernel;
-    return choose_kernel(name, precision);
 }
 
 Settings asked_settings(const Arguments& arguments, const std::string& task, int64_t seed) {
@@ -2038,7 +2039,7 @@ Settings asked_settings(const Arguments& arguments, const std::string& task, int
         set_from(settings, name, assignment.substr(equals + 1), "command line");
     }
     check_together(settings);
-    settings.arithmetic = asked_kernel(arguments, settings).arithmetic;
+    settings.arithmetic = kernel_named(arguments["--kernel"]).arithmetic;
     return settings;
 }
 
@@ -2076,7 +2077,7 @@ void command_train(const Arguments& arguments) {
         for (const SettingRow& row : setting_rows)
             line += std::string(" ") + row.name + "=" + setting_text(settings, row);
         std::fprintf(stderr, "%s:%s\n", folder.c_str(), line.c_str());
-        train(settings, folder, {asked_kernel(arguments, settings), threads, static_cast<double>(checkpoint_every)});
+        train(settings, folder, {kernel_named(arguments["--kernel"]), threads, static_cast<double>(checkpoint_every)});
     }
 }
 
@@ -2084,7 +2085,7 @@ template <class Environment>
 void evaluate_model(const Environment& environment, const Settings& settings, const TensorFile& file,
                     const Arguments& arguments) {
     const int count = static_cast<int>(whole_number(arguments["--episodes"], "--episodes", 1, 10000));
-    Compute compute(asked_kernel(arguments, settings), thread_count(arguments));
+    Compute compute(kernel_named(arguments["--kernel"]), thread_count(arguments));
     Run run(compute, settings, environment.spec());
     load_model(run, file);
     std::vector<Environment> environments(static_cast<size_t>(count), environment);
@@ -2113,7 +2114,7 @@ void command_export(const Arguments& arguments) {
     const TensorFile model = open_model(arguments.words[0]);
     const Settings settings = settings_from_text(model.text("settings"), model.path);
     with_environment(settings, [&](const auto& environment) {
-        Compute compute(choose_kernel("auto"), 1);
+        Compute compute(best_kernel(), 1);
         Run run(compute, settings, environment.spec());
         load_model(run, model);
         load_counts(run, model);
@@ -2136,7 +2137,7 @@ void command_import(const Arguments& arguments) {
         own ? settings_from_text(file.text("settings"), file.path) : asked_settings(arguments, arguments["--task"], 0);
     require_room(file, settings);
     with_environment(settings, [&](const auto& environment) {
-        Compute compute(choose_kernel("auto"), 1);
+        Compute compute(best_kernel(), 1);
         Run run(compute, settings, environment.spec());
         if (!load_odt(run, file)) {
             if (settings.behaviour == "random")
@@ -2335,7 +2336,7 @@ double estimated_seconds(Settings settings) {
     if (settings.task != "gridworld") settings.behaviour = "random";
     double seconds = 0;
     with_environment(settings, [&](const auto& environment) {
-        Compute compute(choose_kernel("auto"), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
+        Compute compute(best_kernel(), static_cast<int>(std::max(1u, std::thread::hardware_concurrency())));
         Run run(compute, settings, environment.spec());
         begin_run(run, make_data_set(settings, environment));
         update(run);
@@ -2481,7 +2482,7 @@ void command_tasks(const Arguments& arguments) {
 #include "tests/check.hpp"
 
 void command_bench(const Arguments& arguments) {
-    choose_kernel(arguments["--kernel"]);  // refuses what the machine lacks
+    kernel_named(arguments["--kernel"]);  // refuses what the machine lacks
     const int threads = thread_count(arguments);
     const std::string what = arguments.words.empty() ? "updates" : arguments.words[0];
     if (what != "updates" && what != "environments" && what != "random-policy")
@@ -2517,7 +2518,6 @@ const std::vector<Command>& commands() {
           {"--weights", "MODEL", "", "begin with a model's network, temperature and normaliser, not with random ones"},
           {"--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
           kernel_option,
-          precision_option,
           threads_option,
           {"--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"}},
          command_train},
@@ -2526,7 +2526,7 @@ const std::vector<Command>& commands() {
          1,
          1,
          "evaluate a saved model; needs nothing else",
-         {{"--episodes", "N", "1", "episodes"}, kernel_option, precision_option, threads_option},
+         {{"--episodes", "N", "1", "episodes"}, kernel_option, threads_option},
          command_eval},
         {"export",
          "MODEL OUT",
@@ -2546,8 +2546,7 @@ const std::vector<Command>& commands() {
           set_option,
           physics_option,
           dataset_option,
-          kernel_option,
-          precision_option},
+          kernel_option},
          command_import},
         {"collect",
          "ID",

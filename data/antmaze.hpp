@@ -206,7 +206,7 @@ inline AntMazeSet collect_ant_maze_set(const MujocoTask& task, size_t steps, uin
     const bool diverse = std::string_view(task.name) == "antmaze-umaze-diverse";
     const Random random{seed, Stream::data_set}, resets{seed, Stream::environment};
     MujocoEnvironment environment(task, Physics::d4rl);
-    Compute compute(choose_kernel("auto"), 1);
+    Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
     AntMazeSet set;
     std::vector<float> state(29), seen(walking_ant_state), action(8);

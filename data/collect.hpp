@@ -356,7 +356,7 @@ inline void collect_medium(const std::string& path, const MujocoTask& task, size
     check_policy(policy, live_columns(task), task.action_dim);
     LiveTask environment(task);
     const MujocoEnvironment& body = environment.body;
-    Compute compute(choose_kernel("auto"), 1);
+    Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
     GymSet<float> set;
     for (uint64_t number = data_set_episodes; set.length() < steps; ++number) {
@@ -424,7 +424,7 @@ inline GymSet<double> retrace(const sac::Learner& learner, LiveTask& environment
 inline void collect_medium_replay(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
                                   const Training& training, const std::string& checkpoint, const Watch& watch) {
     LiveTask environment(task);
-    Compute compute(choose_kernel("auto"), training.threads);
+    Compute compute(best_kernel(), training.threads);
     sac::Learner learner(training.settings, environment.spec(), compute);
     const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
     save_trained_policy(path + ".policy.safetensors", learner, training, returns);
@@ -442,7 +442,7 @@ inline void collect_medium_replay(const std::string& path, const MujocoTask& tas
 inline void train_walker(const std::string& path, const Training& training, const std::string& checkpoint,
                          const Watch& watch) {
     WalkingAnt environment;
-    Compute compute(choose_kernel("auto"), training.threads);
+    Compute compute(best_kernel(), training.threads);
     sac::Learner learner(training.settings, environment.spec(), compute);
     const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
     save_trained_policy(path, learner, training, returns);

@@ -1,6 +1,6 @@
 // bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's peaks first, then
-// each kernel's share of them at the shapes that training uses, the update of both networks in every precision that the
-// machine has, look-ups, acting. Medians and ranges; a machine's clock moves with its neighbours, so figures of different
+// each kernel's share of them at the shapes that training uses, the update of both networks with the best
+// kernel, look-ups, acting. Medians and ranges; a machine's clock moves with its neighbours, so figures of different
 // runs do not compare.
 // Included by wodtem.cpp, after training. Leaves out: judging; a test never looks at a clock.
 #pragma once
@@ -112,42 +112,24 @@ ALWAYS_INLINE float burn_vectors(int64_t rounds) {
     return total[0];
 }
 
-template <class Tiles>
-float burn_tiles(int64_t rounds) {
-    alignas(64) static const uint16_t zeros[part_size] = {};
-    alignas(64) float c[part_size];
-    Tiles tiles;
-    Tiles::prepare(true);
-    tiles.clear();
-    tiles.load_a(zeros);
-    tiles.load_b(zeros);
-    for (int64_t round = 0; round < rounds; ++round) tiles.multiply();
-    tiles.store_c(c, part_lines);
-    Tiles::prepare(false);
-    return c[0];
-}
-
 #ifdef X86_KERNELS
 __attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) { return burn_vectors<Float16, true>(rounds); }
 __attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) { return burn_vectors<Float8, true>(rounds); }
 #endif
 
-// Operations a second of one core's unit, in its own products: a float product of `parts` is several of them.
+// Operations a second of one core in the kernel's own instructions.
 double burn_rate(const Kernel& kernel) {
-    float (*burn)(int64_t) = kernel.parts > 0 ? burn_tiles<TilesInSoftware> : burn_vectors<Float4, false>;
-    double operations = kernel.parts > 0 ? 2.0 * 32 * 32 * 32 : 2.0 * burn_chains * kernel.tile_columns / 2;
+    float (*burn)(int64_t) = burn_vectors<Float4, false>;
+    const double operations = 2.0 * burn_chains * kernel.tile_columns / 2;
 #ifdef X86_KERNELS
     if (&kernel == &kernel_avx512) burn = burn_avx512;
     if (&kernel == &kernel_avx2) burn = burn_avx2;
-    if (kernel.supported == amx_granted) burn = burn_tiles<TilesInAmx>;
 #endif
     volatile float sink = 0;
-    const double rounds = std::max(1.0, (kernel.supported == everywhere && kernel.parts > 0 ? 1e7 : 3e8) / operations);
+    const double rounds = std::max(1.0, 3e8 / operations);
     const double seconds = seconds_of([&] { sink = sink + burn(static_cast<int64_t>(rounds)); });
     return operations * rounds / seconds;
 }
-
-int products_of_parts(const Kernel& kernel) { return kernel.parts > 0 ? kernel.parts * (kernel.parts + 1) / 2 : 1; }
 
 std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic; }
 
@@ -202,7 +184,6 @@ constexpr Shape2 product_shapes[] = {
 // Returns the mean rate at the gym network's shapes, operations a second.
 double bench_products(Measurements& measured, const Kernel& kernel, int threads) {
     Compute compute(kernel, threads);
-    const double products = products_of_parts(kernel);
     const std::string group =
         "products, " + label(kernel) + ", " + std::to_string(threads) + " threads; share of the peak";
     double gym_operations = 0, gym_seconds = 0;
@@ -224,7 +205,7 @@ double bench_products(Measurements& measured, const Kernel& kernel, int threads)
         for (int round = 0; round < 9; ++round) {
             const double before = burn_rate(kernel), time = seconds_of(multiply) / repeats;
             seconds.push_back(time);
-            shares.push_back(100 * products * operations / time / threads / std::max(before, burn_rate(kernel)));
+            shares.push_back(100 * operations / time / threads / std::max(before, burn_rate(kernel)));
         }
         char name[80];
         std::snprintf(name, sizeof name, "%-20s %5d x %4d x %4d", s.what, s.M, s.N, s.K);
@@ -322,7 +303,7 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
                  layers = static_cast<double>(run.agent.settings.layers);
     const double operations = 2 * static_cast<double>(episodes) *
                               ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d),
-                 bytes = 12 * layers * d * d * (kernel.parts > 0 ? 2 * kernel.parts : 4);
+                 bytes = 12 * layers * d * d * static_cast<double>(kernel.element_bytes);
     measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]) +
                       "; share of the products' own rate or the memory's speed",
                   std::to_string(episodes) + " episodes, " + label(kernel), time, operations, bytes,
@@ -432,11 +413,8 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
 void bench_all(const std::string& kernel_name, int threads, bool json) {
     Measurements measured{json, {}};
     std::vector<const Kernel*> chosen;
-    for (const Kernel* kernel : kernels) {
-        const bool imitation = kernel->parts > 0 && kernel->supported == everywhere;
-        if (kernel->supported() && (kernel_name == "auto" ? !imitation : kernel_name == kernel->name))
-            chosen.push_back(kernel);
-    }
+    for (const Kernel* kernel : kernels)
+        if (kernel->supported() && (kernel_name == "auto" || kernel_name == kernel->name)) chosen.push_back(kernel);
     if (!json) std::printf("medians (and ranges); a share of the peak is of the peak of its own moment\n");
     for (const Kernel* kernel : chosen) {
         double peak = 0;
@@ -450,9 +428,7 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
     std::vector<double> rates;
     for (const Kernel* kernel : chosen) rates.push_back(bench_products(measured, *kernel, threads));
     bench_other_kernels(measured, *chosen[0], threads, bandwidth);
-    for (size_t i = 0; i < chosen.size(); ++i)  // with vectors only the best ones: the others are slower in proportion
-        if (chosen[i]->parts > 0 || i == 0 || chosen[i - 1]->parts > 0)
-            bench_updates(measured, *chosen[i], threads, {rates[i], bandwidth});
+    bench_updates(measured, *chosen[0], threads, {rates[0], bandwidth});  // others are slower in proportion
     rusage use{};
     getrusage(RUSAGE_SELF, &use);
     if (!json) std::printf("peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
@@ -526,7 +502,7 @@ void bench_learner(const std::string& kernel, int threads) {
     LiveTask environment(*find_mujoco_task("hopper"));
     sac::Settings settings = gym_training(*environment.body.task, 0, 20000).settings;
     settings.random_steps = 1000, settings.steps_per_update = 1;
-    Compute compute(choose_kernel(kernel), threads);
+    Compute compute(kernel_named(kernel), threads);
     sac::Learner learner(settings, environment.spec(), compute);
     const auto learn = [&] {
         for (const uint64_t end = learner.progress.updates + 200; learner.progress.updates < end;)

@@ -423,7 +423,7 @@ void check_rng(Case& c) {
     }
     // What is drawn from it by (seed, stream, step, site, index).
     const Random random{static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF)),
-                        static_cast<Stream>(c.whole("stream", {}, 0, 0xFFFFFFFF))};
+                        static_cast<uint32_t>(c.whole("stream", {}, 0, 0xFFFFFFFF))};
     if (c.has("out/dropout")) {
         const uint64_t n = c.array_size("out/dropout");
         const Dropout dropout{random, static_cast<uint64_t>(c.whole("update", 0, 0, 0x1p53)),
@@ -1800,7 +1800,7 @@ void command_check(const Arguments& arguments) {
     if (dumps == arguments["--run"].empty() || dumps != arguments.words.empty())
         fail("usage.words", "wodtem check takes vector files, or --dump FILE --run DIR");
     if (dumps) return vectors::dump_run(arguments["--dump"], {arguments["--run"]}, arguments);
-    Compute compute(choose_kernel(arguments["--kernel"]), thread_count(arguments));
+    Compute compute(kernel_named(arguments["--kernel"]), thread_count(arguments));
     size_t bad = 0;
     for (const std::string& path : arguments.words) {
         try {

@@ -155,7 +155,7 @@ void dump_run(const std::string& path, const RunFolder& folder, const Arguments&
                  settings.dataset_path.c_str(), folder.path.c_str(), settings.dataset_sha256.c_str());
     }
     with_environment(settings, [&](const auto& environment) {
-        Compute compute(choose_kernel(arguments["--kernel"], settings.arithmetic), thread_count(arguments));
+        Compute compute(kernel_named(arguments["--kernel"], settings.arithmetic), thread_count(arguments));
         Run run(compute, settings, environment.spec());
         if (fs::exists(checkpoint)) load_state(run, checkpoint);
         if (!fs::exists(checkpoint)) begin_run(run, make_data_set(settings, environment));

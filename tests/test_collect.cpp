@@ -92,7 +92,7 @@ namespace {
 const MujocoTask& task_of(const char* name) { return *find_mujoco_task(name); }
 
 Compute& one_thread() {
-    static Compute compute(choose_kernel("auto"), 1);
+    static Compute compute(best_kernel(), 1);
     return compute;
 }
 
@@ -125,7 +125,7 @@ TEST(ant_is_sent_to_the_next_cell_and_at_last_to_the_goal) {
 // The walker
 
 TEST(walker_sees_the_world_turned_by_its_heading) {
-    const Random random{test_seed(), static_cast<Stream>(1000)};
+    const Random random{test_seed(), 1000};
     for (uint64_t trial = 0; trial < 200; ++trial) {
         std::vector<double> o(29);
         for (uint32_t i = 0; i < 29; ++i) o[i] = static_cast<double>(random.normal(trial, i));
@@ -154,7 +154,7 @@ TEST(walker_sees_the_world_turned_by_its_heading) {
 
 TEST(walking_ant_is_paid_its_speed_in_the_commanded_direction) {
     WalkingAnt ant;
-    const Random resets{test_seed(), Stream::environment}, random{test_seed(), static_cast<Stream>(1000)};
+    const Random resets{test_seed(), Stream::environment}, random{test_seed(), 1000};
     std::vector<float> state(27), action(8);
     ant.reset(resets, 3, state.data());
     std::vector<double> headings = {ant.heading};

@@ -18,7 +18,7 @@ constexpr double unit = 0x1p-24;  // largest relative error of a float rounding;
 struct Draws {
     uint64_t test;
     uint32_t count = 0;
-    Random random = {test_seed(), static_cast<Stream>(1000)};
+    Random random = {test_seed(), 1000};
     double normal() { return random.normal(test, count++); }
     double uniform() { return random.uniform(test, count++); }
     template <class T>
@@ -55,7 +55,7 @@ std::vector<const Kernel*> kernels_of_this_machine() {
         if (kernel->supported())
             found.push_back(kernel);
         else
-            std::printf("  this machine cannot run kernel %s %s: not tested\n", kernel->name, kernel->precision);
+            std::printf("  this machine cannot run kernel %s: not tested\n", kernel->name);
     }
     return found;
 }
@@ -85,8 +85,7 @@ Call call_that_draws(Words4 w, const Random& random) {
         return x;
     };
     for (uint32_t round = 10; round-- > 0;) {
-        const uint32_t key0 = random.seed + round * 0x9E3779B9,
-                       key1 = static_cast<uint32_t>(random.stream) + round * 0xBB67AE85;
+        const uint32_t key0 = random.seed + round * 0x9E3779B9, key1 = random.stream + round * 0xBB67AE85;
         const uint32_t c0 = w[3] * inverse(0xD2511F53), c2 = w[1] * inverse(0xCD9E8D57);
         const uint32_t high0 = static_cast<uint32_t>(uint64_t{0xD2511F53} * c0 >> 32),
                        high2 = static_cast<uint32_t>(uint64_t{0xCD9E8D57} * c2 >> 32);
@@ -121,7 +120,7 @@ TEST(sixteen_counters_at_once_have_the_words_of_each) {
 }
 
 TEST(random_numbers_have_their_moments_within_five_sigma) {
-    const Random random = {test_seed(), Stream::batch};
+    const Random random = {test_seed(), 3};
     constexpr int n = 100000;
     double mean = 0, square = 0, normal_moment[5] = {};
     for (uint32_t i = 0; i < n; ++i) {
@@ -141,7 +140,7 @@ TEST(random_numbers_have_their_moments_within_five_sigma) {
 }
 
 TEST(below_is_unbiased_for_bounds_that_are_no_power_of_two) {
-    const Random random = {test_seed(), Stream::batch};
+    const Random random = {test_seed(), 3};
     for (const uint64_t bound : {uint64_t{7}, uint64_t{14 * 104729}, uint64_t{7} << 61}) {
         constexpr int n = 70000;
         std::vector<int> count(7);
@@ -159,7 +158,7 @@ TEST(below_is_unbiased_for_bounds_that_are_no_power_of_two) {
 }
 
 TEST(random_numbers_stay_in_range_at_the_extreme_words) {
-    const Random random = {test_seed(), Stream::batch};
+    const Random random = {test_seed(), 3};
     const auto drawn = [&](Words4 words) {
         const Call call = call_that_draws(words, random);
         CHECK(random.words(call.step, call.index, call.site) == words);
@@ -235,43 +234,7 @@ struct Product {
     double exact, bound;
 };
 
-// The nearest number of eight significant bits, by arithmetic: x = 0.1f * 2^e has its ties to even at nearbyint.
-float eight_bits(float x) {
-    int exponent = 0;
-    const float fraction = std::frexp(x, &exponent);
-    return std::ldexp(std::nearbyint(fraction * 256), exponent - 8);
-}
-
-// The same for bf16 parts: the products that the definition names, in its order.
-Product product_of_parts(const float* a, const float* b, int K, int N, float start, int parts) {
-    static const std::vector<std::pair<int, int>> turns[] = {
-        {}, {{0, 0}}, {{0, 1}, {0, 0}, {1, 0}}, {{0, 2}, {0, 1}, {0, 0}, {1, 0}, {1, 1}, {2, 0}}};
-    const auto part = [](float x, int i) {
-        for (; i > 0; --i) x -= eight_bits(x);
-        return eight_bits(x);
-    };
-    Product p = {start, start, std::fabs(start)};
-    for (int first = 0; first < K; first += 32) {
-        const int last = std::min(K, first + 32);
-        for (const auto& [i, j] : turns[parts]) {
-            float even = 0, odd = 0;
-            for (int k = first; k < last; ++k) (k % 2 == 0 ? even : odd) += part(a[k], i) * part(b[k * N], j);
-            p.value += even + odd;
-        }
-        for (int k = first; k < last; ++k) {
-            p.exact += static_cast<double>(a[k]) * b[k * N];
-            p.bound += std::fabs(static_cast<double>(a[k]) * b[k * N]);
-        }
-    }
-    // A part is at most 2^-8 of the one before. What is left out: a_0 b_1, b_0 a_1 and what follows; a_0 b_2, a_1 b_1,
-    // a_2 b_0 ...; the four products of order 2^-24. And a rounding for each of 16 k, each turn and each 32 k.
-    const double left_out[] = {0, 2 * 0x1p-8, 3 * 0x1p-16, 4 * 0x1p-24};
-    p.bound *= 1.01 * (left_out[parts] + (16 + parts * (parts + 1) / 2 * ((K + 31) / 32)) * unit);
-    return p;
-}
-
 Product product(const float* a, const float* b, int K, int N, float start, const Kernel& kernel) {
-    if (kernel.parts > 0) return product_of_parts(a, b, K, N, start, kernel.parts);
     const bool fused = kernel.arithmetic == std::string("fused");
     Product p = {start, start, std::fabs(start)};
     for (int first = 0; first < K; first += 256) {
@@ -312,10 +275,7 @@ void check_matmul(Compute& compute, Draws& draws, int M, int N, int K) {
                 bool same = same_bits(c, expected[store]);
                 if (compute.kernel.arithmetic != std::string("fused")) {
                     const View<float> to = {plain.data(), N + 3};
-                    if (compute.kernel.parts == 0)
-                        matmul_plain(to, stored_a.view, stored_b.view, M, N, K, how);
-                    else
-                        matmul_parts_plain(to, stored_a.view, stored_b.view, M, N, K, how, compute.kernel.parts);
+                    matmul_plain(to, stored_a.view, stored_b.view, M, N, K, how);
                     same = same && same_bits(c, plain);
                 }
                 if (!same)
@@ -337,7 +297,7 @@ TEST(matmul_has_the_bits_of_its_definition_around_every_tile_edge) {
         for (const int K : {0, 1, 255, 256, 257, 513})
             for (const int M : {0, 1, r - 1, r, r + 1, 2 * r + 1, 4 * r + 1})
                 for (const int N : {0, 1, c - 1, c, c + 1, 2 * c})
-                    if ((K < 300 && kernel->parts == 0) || (M != r - 1 && N != c - 1 && M <= r + 1 && N <= c + 1))
+                    if (K < 300 || (M != r - 1 && N != c - 1 && M <= r + 1 && N <= c + 1))
                         check_matmul(compute, draws, M, N, K);
     }
 }
@@ -351,7 +311,7 @@ TEST(matmul_gives_the_same_bits_for_any_number_of_threads) {
                          300);  // many rows; blocks of rows
             check_matmul(compute, draws, 3, 9 * kernel->tile_columns,
                          70);  // wide: blocks of columns
-            if (kernel->parts == 0) check_matmul(compute, draws, 401, 5, 30);
+            check_matmul(compute, draws, 401, 5, 30);
         }
 }
 
@@ -399,18 +359,7 @@ TEST(matmul_of_one_row_equals_that_row_among_a_hundred) {
     }
 }
 
-TEST(nearest_bf16_rounds_to_even_and_keeps_what_is_not_finite) {
-    Draws draws = {4};
-    for (const float x : draws.normals<float>(1000)) CHECK_EQUAL(bf16_nearest(x), eight_bits(x));
-    CHECK_EQUAL(bf16_nearest(1 + 0x1p-8f), 1.0f);             // halfway: to the even 1
-    CHECK_EQUAL(bf16_nearest(1 + 3 * 0x1p-8f), 1 + 0x1p-6f);  // halfway: up to the even one
-    CHECK_EQUAL(bf16_nearest(1 + 0x1p-8f + 0x1p-23f), 1 + 0x1p-7f);
-    CHECK_EQUAL(bf16_nearest(-INFINITY), -INFINITY);
-    CHECK(std::isnan(bf16_nearest(NAN)) && std::isnan(bf16_nearest(-NAN)));
-    CHECK(std::signbit(bf16_nearest(-0.0f)));
-}
-
-TEST(products_that_are_not_finite_stay_so_in_every_precision) {
+TEST(products_that_are_not_finite_stay_so_in_every_kernel) {
     for (const Kernel* kernel : kernels_of_this_machine())
         for (const float bad : {NAN, INFINITY}) {
             Compute compute(*kernel, 1);
@@ -442,22 +391,11 @@ TEST(every_part_of_a_product_is_finished_once_after_its_last_addition) {
         }
 }
 
-TEST(kernels_are_chosen_by_name_and_precision) {
-    const std::string best = kernels_of_this_machine().front()->name;
-    CHECK_EQUAL(std::string(choose_kernel("portable").arithmetic), std::string("plain"));
-    CHECK_EQUAL(&choose_kernel("auto"), kernels_of_this_machine().front());
-    for (const char* precision : {"bf16x6", "bf16x3", "bf16"})
-        CHECK_EQUAL(std::string(choose_kernel("portable", precision).arithmetic), std::string(precision));
-    if (best == "amx") {
-        CHECK_EQUAL(std::string(choose_kernel("auto").arithmetic), std::string("bf16x6"));
-        CHECK_EQUAL(std::string(choose_kernel("auto", "bf16").name), best);
-    } else {  // an imitation is for whoever asks for it
-        CHECK_FAILS("usage.precision", choose_kernel("auto", "bf16"));
-        CHECK_FAILS("usage.kernel", choose_kernel("amx"));
-    }
-    CHECK_FAILS("usage.kernel", choose_kernel("avx2", "bf16"));
-    CHECK_FAILS("usage.kernel", choose_kernel("abacus"));
-    CHECK_FAILS("usage.precision", choose_kernel("auto", "fp64"));
+TEST(kernels_are_found_by_name) {
+    CHECK_EQUAL(&best_kernel(), kernels_of_this_machine().front());
+    for (const Kernel* kernel : kernels) CHECK_EQUAL(find_kernel(kernel->name), kernel->supported() ? kernel : nullptr);
+    CHECK_EQUAL(find_kernel("portable")->arithmetic, std::string("plain"));
+    CHECK(find_kernel("abacus") == nullptr);
 }
 
 TEST(dot_equals_the_sum_in_double) {
@@ -493,7 +431,7 @@ Parameter<double> leaf(Draws& draws, int rows, int columns, double scale = 1) {
 double probe(Tape<double>& tape, const Build& build, bool backward) {
     tape.reset();
     const Tensor<double> y = build(tape);
-    const Random random = {test_seed(), static_cast<Stream>(1001)};
+    const Random random = {test_seed(), 1001};
     double sum = 0;
     for (uint32_t i = 0; i < y.size(); ++i) sum += random.normal(0, i) * y.value[i];
     if (!backward) return sum;
@@ -832,7 +770,7 @@ struct PlainTransformer {
 template <class T>
 void check_against_plain(double bound) {
     Draws draws = {11};
-    Compute compute(choose_kernel("auto"), 2);
+    Compute compute(best_kernel(), 2);
     for (const Head head : {Head::squashed_gaussian, Head::categorical, Head::deterministic})
         for (const int max_timesteps : {0, 5})
             for (const std::vector<int>& lengths : {std::vector<int>{1, 1}, {4}, {1, 3, 4, 2}}) {
@@ -1019,7 +957,7 @@ TEST(training_gives_the_same_bits_for_any_number_of_threads) {
     const std::vector<float> ones(static_cast<size_t>(batch.steps()), 1.0f);
     std::vector<std::vector<float>> first;
     for (const int threads : {1, 2, 5}) {
-        Compute compute(choose_kernel("auto"), threads);
+        Compute compute(best_kernel(), threads);
         Tape<float> tape(compute);
         for (Parameter<float>& parameter : model.parameters) parameter.gradient.assign(parameter.gradient.size(), 0);
         const Policy<float> policy = forward(tape, model, batch, Ask::every_state);

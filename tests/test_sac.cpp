@@ -16,7 +16,7 @@
 namespace {
 
 Compute& one_thread() {
-    static Compute compute(choose_kernel("auto"), 1);
+    static Compute compute(best_kernel(), 1);
     return compute;
 }
 
@@ -32,7 +32,7 @@ struct TemporaryFile {
 struct Draws {
     uint64_t test;
     uint32_t count = 0;
-    float normal() { return Random{test_seed(), static_cast<Stream>(1000)}.normal(test, count++); }
+    float normal() { return Random{test_seed(), 1000}.normal(test, count++); }
     std::vector<float> normals(size_t n) {
         std::vector<float> x(n);
         for (float& value : x) value = normal();
@@ -564,7 +564,7 @@ TEST(sac_resumed_run_has_the_same_bytes_for_any_number_of_threads) {
     const std::string whole = run_bytes(settings, Rail{}, 120, 0, one_thread());
     for (const int stop : {13, 60, 103})  // during an episode while acting at random; between two; with a full ring
         CHECK(run_bytes(settings, Rail{}, 120, stop, one_thread()) == whole);
-    Compute two_threads(choose_kernel("auto"), 2);
+    Compute two_threads(best_kernel(), 2);
     CHECK(run_bytes(settings, Rail{}, 120, 61, two_threads) == whole);
     settings.seed += 1;
     CHECK(run_bytes(settings, Rail{}, 120, 0, one_thread()) != whole);

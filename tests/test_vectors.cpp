@@ -69,7 +69,7 @@ Checked check_bytes(const std::string& bytes, bool verbose = false) {
     char path[] = "/tmp/wodtem-vectors-XXXXXX";
     ::close(::mkstemp(path));
     std::ofstream(path, std::ios::binary) << bytes;
-    Compute compute(choose_kernel("auto"), 1);
+    Compute compute(best_kernel(), 1);
     Checked checked;
     std::exception_ptr problem;
     try {
