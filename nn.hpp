@@ -1,18 +1,18 @@
 // nn.hpp: everything numerical that a decision transformer needs, and nothing about reinforcement learning.
 //
-// In order: errors; random numbers by counter; worker threads; matrix products: what they are, the kernels for a tile of
-// one, how one is shared out; tensors and the tape; the operations of the network, each with its backward; the decision
-// transformer (DT, ODT sec. 3); policy heads; optimisers.
+// In order: errors; random numbers by counter; worker threads; vector code; matrix products: their definition, the
+// kernels for a tile of one, how one is shared out; dot products; tensors and the tape; the operations of the network,
+// each with its backward; the decision transformer (DT, ODT sec. 3); policy heads; optimisers.
 // Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
 // number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
-// Leaves out: anything that knows what a return, an episode or a file is.
+// Leaves out: anything that knows what a return, an episode, a file or an option is.
 #pragma once
 
 #include <algorithm>
 #include <array>
 #include <atomic>
-#include <bit>
 #include <cmath>
+#include <condition_variable>
 #include <cstdarg>
 #include <cstddef>
 #include <cstdint>
@@ -21,6 +21,7 @@
 #include <functional>
 #include <map>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <numeric>
 #include <stdexcept>
@@ -33,20 +34,21 @@
 #include <vector>
 
 #if defined(__x86_64__) && !defined(__clang__)
-#define X86_KERNELS  // in AVX2 and AVX-512, beside the portable one
+#define X86_KERNELS  // in AVX2 and AVX-512, beside the portable ones
 #endif
 #define ALWAYS_INLINE [[gnu::always_inline]] inline
+#define INLINE_LAMBDA __attribute__((always_inline))
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Errors. Every failure is one sentence for the person at the terminal (what, where, expected and got, what to do) and
-// one stable id ("safetensors.truncated"), by which tests and callers know it.
+// one stable id ("safetensors.truncated"), by which callers and tests know it.
 
 struct Error : std::runtime_error {
     std::string id;
     Error(std::string error_id, const std::string& sentence) : std::runtime_error(sentence), id(std::move(error_id)) {}
 };
 
-// Formats like printf; a sentence of any length.
+// Throws an Error. The sentence is formatted as by printf and may have any length.
 [[noreturn]] [[gnu::format(printf, 2, 3)]] inline void fail(const char* id, const char* format, ...) {
     va_list arguments, again;
     va_start(arguments, format);
@@ -64,86 +66,43 @@ struct Error : std::runtime_error {
 
 using Words4 = std::array<uint32_t, 4>;
 
-// product = m times the low half of x, or of each lane. GCC 12 does not find the one instruction that this takes.
-template <class Number>
-ALWAYS_INLINE void multiply_low(Number& product, const Number& x, uint32_t m) {
-#ifdef X86_KERNELS
-    if constexpr (sizeof(Number) == 64) {
-        asm("vpmuludq %2, %1, %0" : "=v"(product) : "v"(x), "v"(Number{} + m));
-        return;
-    }
-#endif
-    product = (x & 0xFFFFFFFF) * m;
-}
-
 // Philox4x32-10. Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011, section 3.3.
-// Of one or more counters, in the low halves of 64 bits (what the high ones hold does not matter). They take turns: a
-// product is long in coming.
-template <class Number, size_t Count>
-ALWAYS_INLINE void philox_rounds(Number (&counters)[Count][4], uint32_t key0, uint32_t key1) {
+// words [Count, 4]: the outputs for `Count` counters that differ in their first word: counter[0], counter[0] + 1, ...
+// The loops over the counters are plain so that the compiler turns them into vectors.
+template <uint32_t Count>
+void philox_words(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+    uint32_t c0[Count], c1[Count], c2[Count], c3[Count];
+    for (uint32_t i = 0; i < Count; ++i) {
+        c0[i] = counter[0] + i;
+        c1[i] = counter[1];
+        c2[i] = counter[2];
+        c3[i] = counter[3];
+    }
     for (int round = 0; round < 10; ++round) {
-        for (Number(&c)[4] : counters) {
-            Number product0, product1;
-            multiply_low(product0, c[0], 0xD2511F53);
-            multiply_low(product1, c[2], 0xCD9E8D57);
-            c[0] = (product1 >> 32) ^ c[1] ^ key0;
-            c[1] = product1;
-            c[2] = (product0 >> 32) ^ c[3] ^ key1;
-            c[3] = product0;
+        for (uint32_t i = 0; i < Count; ++i) {
+            const uint64_t product0 = uint64_t{0xD2511F53} * c0[i], product1 = uint64_t{0xCD9E8D57} * c2[i];
+            c0[i] = static_cast<uint32_t>(product1 >> 32) ^ c1[i] ^ key0;
+            c2[i] = static_cast<uint32_t>(product0 >> 32) ^ c3[i] ^ key1;
+            c1[i] = static_cast<uint32_t>(product1);
+            c3[i] = static_cast<uint32_t>(product0);
         }
         key0 += 0x9E3779B9;  // golden ratio
         key1 += 0xBB67AE85;  // sqrt(3) - 1
     }
+    for (uint32_t i = 0; i < Count; ++i) {
+        words[4 * i] = c0[i];
+        words[4 * i + 1] = c1[i];
+        words[4 * i + 2] = c2[i];
+        words[4 * i + 3] = c3[i];
+    }
 }
 
+// One counter's 128 bits.
 inline Words4 philox(const Words4& counter, uint32_t key0, uint32_t key1) {
-    uint64_t c[1][4] = {{counter[0], counter[1], counter[2], counter[3]}};
-    philox_rounds(c, key0, key1);
     Words4 words;
-    for (size_t j = 0; j < 4; ++j) words[j] = static_cast<uint32_t>(c[0][j]);
+    philox_words<1>(words.data(), counter, key0, key1);
     return words;
 }
-
-// For the loops that cost most: compiled once for each instruction set, and chosen when the program starts. Every
-// operation is rounded by itself (-ffp-contract=off), so the bits are the same. (The sanitizers cannot start with it.)
-#if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
-#define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define EACH_TARGET
-#endif
-
-// Whether vectors of 64 bytes fit a register. Where they do not, GCC 12 takes them apart in memory, ten times as slow
-// as vectors of 32.
-#ifdef X86_KERNELS
-inline const bool wide_vectors = __builtin_cpu_supports("x86-64-v4");
-#else
-constexpr bool wide_vectors = false;
-#endif
-
-// words[4 i + j] = philox({counter[0] + i, counter[1], counter[2], counter[3]})[j] for i < 16.
-inline void philox_16_plain(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
-    for (uint32_t i = 0; i < 16; ++i) {
-        const Words4 four = philox({counter[0] + i, counter[1], counter[2], counter[3]}, key0, key1);
-        std::copy(four.begin(), four.end(), words + 4 * i);
-    }
-}
-#ifdef X86_KERNELS
-__attribute__((target("arch=x86-64-v4"))) inline void philox_16_avx512(uint32_t* words, const Words4& counter,
-                                                                       uint32_t key0, uint32_t key1) {
-    typedef uint64_t Lanes __attribute__((vector_size(64)));
-    Lanes c[2][4];
-    for (uint32_t half = 0; half < 2; ++half) {
-        c[half][0] = Lanes{0, 1, 2, 3, 4, 5, 6, 7} + (counter[0] + 8 * half);
-        for (size_t j = 1; j < 4; ++j) c[half][j] = Lanes{} + counter[j];
-    }
-    philox_rounds(c, key0, key1);
-    for (size_t i = 0; i < 16; ++i)
-        for (size_t j = 0; j < 4; ++j) words[4 * i + j] = static_cast<uint32_t>(c[i / 8][j][i % 8]);
-}
-inline const auto philox_16 = wide_vectors ? philox_16_avx512 : philox_16_plain;
-#else
-inline const auto philox_16 = philox_16_plain;
-#endif
 
 // Each use of chance has a stream of its own: switching one feature on or off moves no other's numbers. The values are
 // part of the format of a run; never renumber. The streams of reinforcement learning are in memory.hpp.
@@ -163,9 +122,11 @@ struct Random {
         return philox({index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed, stream);
     }
 
-    // The words of `index` to `index` + 15, one after the other.
-    void words_16(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
-        philox_16(words, {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)}, seed, stream);
+    // The words of `index` to `index` + Count - 1, one after the other: words [Count, 4].
+    template <uint32_t Count>
+    void many_words(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
+        const Words4 counter = {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)};
+        philox_words<Count>(words, counter, seed, stream);
     }
 
     // Uniform in [0, 1), a multiple of 2^-53.
@@ -181,8 +142,8 @@ struct Random {
         return static_cast<uint64_t>((static_cast<uint128>((uint64_t{w[1]} << 32) | w[0]) * bound) >> 64);
     }
 
-    // Standard normal by Box and Muller, from words 2 and 3. The float functions of libm give the same bits on every
-    // x86 processor, the double ones do not; 24 bits reach 5.8 standard deviations.
+    // Standard normal by Box and Muller, from words 2 and 3; 24 bits reach 5.8 standard deviations.
+    // @LIBM@
     float normal(uint64_t step, uint32_t index, uint32_t site = 0) const {
         const Words4 w = words(step, index, site);
         const float u = (static_cast<float>(w[2] >> 8) + 1.0f) * 0x1p-24f;  // (0, 1]
@@ -192,8 +153,8 @@ struct Random {
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Threads. A fixed set of workers that share out numbered tasks. Who runs a task is left to chance; what a task
-// computes must depend on its number alone, so that results are the same for any number of threads.
+// Threads. A fixed set of workers that share out numbered tasks. Which worker runs a task is left to chance; what a
+// task computes must depend on its number alone, so that results are the same for any number of threads.
 
 class Threads {
   public:
@@ -214,80 +175,151 @@ class Threads {
     int count() const { return static_cast<int>(workers_.size()) + 1; }
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
-    // f must not throw and must not call run(). `serial`: the calling thread alone.
+    // f must not throw and must not call run(). `serial`: the calling thread runs all tasks alone.
     template <class F>
     void run(int tasks, F&& f, bool serial = false) {
         if (serial || workers_.empty() || tasks < 2) {
             for (int task = 0; task < tasks; ++task) f(task, 0);
             return;
         }
-        using Body = std::remove_reference_t<F>;
-        call_.store([](void* body, int task, int worker) { (*static_cast<Body*>(body))(task, worker); },
-                    std::memory_order_relaxed);
-        body_.store(const_cast<void*>(static_cast<const void*>(&f)), std::memory_order_relaxed);
-        tasks_.store(static_cast<uint32_t>(tasks), std::memory_order_relaxed);
-        unfinished_.store(tasks, std::memory_order_relaxed);
-        // Ticket = (generation, tasks not yet taken). The release makes the job above visible to whoever sees it.
-        const uint64_t generation = (ticket_.load(std::memory_order_relaxed) >> 32) + 1;
-        ticket_.store(generation << 32 | static_cast<uint32_t>(tasks), std::memory_order_release);
-        ticket_.notify_all();
+        {
+            const std::lock_guard lock(mutex_);
+            job_ = [&f](int task, int worker) { f(task, worker); };
+            tasks_ = tasks;
+            next_task_ = 0;
+            unfinished_ = tasks;
+            ++jobs_;
+        }
+        wake_.notify_all();
         take_tasks(0);
-        for (int spins = 0; unfinished_.load(std::memory_order_acquire) != 0; ++spins) pause(spins);
+        poll([this] { return unfinished_ == 0; });
+        std::unique_lock lock(mutex_);
+        done_.wait(lock, [this] { return unfinished_ == 0; });
     }
 
   private:
-    using Call = void (*)(void*, int, int);
-
-    static void pause(int spins) {
-        if (spins > 2000) std::this_thread::yield();
+    // Waits until condition() holds, but for some ten microseconds at most. To be woken by the system takes about as
+    // long, which is more than many a job of a small network.
+    template <class Condition>
+    static void poll(Condition condition) {
+        for (int i = 0; i < 300 && !condition(); ++i) {
 #if defined(__x86_64__)
-        __builtin_ia32_pause();
+            __builtin_ia32_pause();
 #endif
+        }
     }
 
-    // Takes tasks until none is left. That none is left stands in the ticket itself, so an old ticket never leads into
-    // the next job: while it names tasks, its job's fields stay, because run() waits for them; a worker that reads
-    // later fields beside it finds that the ticket has moved on, the exchange fails, and nothing was taken.
-    uint64_t take_tasks(int worker) {
-        uint64_t ticket = ticket_.load(std::memory_order_acquire);
+    // Runs tasks of the current job until none is left. The job itself changes only after all its tasks are finished,
+    // so it is read without the lock.
+    void take_tasks(int worker) {
+        std::unique_lock lock(mutex_);
+        while (next_task_ < tasks_) {
+            const int task = next_task_++;
+            lock.unlock();
+            job_(task, worker);
+            lock.lock();
+            if (--unfinished_ == 0) done_.notify_one();
+        }
+    }
+
+    void work(int worker) {
+        uint64_t seen = 0;  // jobs
         while (true) {
-            const Call call = call_.load(std::memory_order_relaxed);
-            void* body = body_.load(std::memory_order_relaxed);
-            const uint32_t left = static_cast<uint32_t>(ticket), task = tasks_.load(std::memory_order_relaxed) - left;
-            if (left == 0) return ticket;
-            if (!ticket_.compare_exchange_weak(ticket, ticket - 1, std::memory_order_acq_rel)) continue;
-            call(body, static_cast<int>(task), worker);
-            unfinished_.fetch_sub(1, std::memory_order_release);
-            ticket = ticket_.load(std::memory_order_acquire);
+            poll([&] { return jobs_ != seen; });
+            {
+                std::unique_lock lock(mutex_);
+                wake_.wait(lock, [&] { return jobs_ != seen; });
+                if (stop_) return;
+                seen = jobs_;
+            }
+            take_tasks(worker);
         }
     }
 
     void stop() {
-        stop_.store(true, std::memory_order_relaxed);
-        ticket_.fetch_add(uint64_t{1} << 32, std::memory_order_release);
-        ticket_.notify_all();
+        {
+            const std::lock_guard lock(mutex_);
+            stop_ = true;
+            ++jobs_;
+        }
+        wake_.notify_all();
         for (std::thread& worker : workers_) worker.join();
     }
 
-    // Spins for some milliseconds between jobs, soon giving way to whoever else wants the core, then sleeps: to be
-    // woken can take longer than a small job, above all on a virtual machine.
-    void work(int worker) {
-        while (true) {
-            const uint64_t seen = take_tasks(worker);
-            if (stop_.load(std::memory_order_relaxed)) return;  // `seen` may be the last ticket: none follows it
-            for (int spins = 0; spins < 20000 && ticket_.load(std::memory_order_relaxed) == seen; ++spins) pause(spins);
-            ticket_.wait(seen, std::memory_order_acquire);
-        }
-    }
-
     std::vector<std::thread> workers_;
-    std::atomic<uint64_t> ticket_{0};
-    std::atomic<Call> call_{nullptr};
-    std::atomic<void*> body_{nullptr};
-    std::atomic<uint32_t> tasks_{0};
-    std::atomic<int> unfinished_{0};
-    std::atomic<bool> stop_{false};
+    std::mutex mutex_;  // guards all that follows
+    std::condition_variable wake_, done_;
+    std::function<void(int, int)> job_;
+    int tasks_ = 0, next_task_ = 0;
+    bool stop_ = false;
+    std::atomic<int> unfinished_{0};  // tasks of the current job; atomic, as is jobs_, for poll()
+    std::atomic<uint64_t> jobs_{0};   // begun so far, the order to stop among them
 };
+
+template <class N>
+N divide_up(N n, std::type_identity_t<N> by) {
+    return (n + by - 1) / by;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Vector code. The loops that cost most are compiled once for each generation of x86 processors, for float; double,
+// which only checks, has the portable version alone. Every operation is rounded by itself (-ffp-contract=off), and the
+// order of additions is written out, so all versions give the same bits.
+
+// For functions that stand by themselves: the compiler makes the versions, and chooses when the program starts. (The
+// sanitizers cannot start with it.)
+#if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+#define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define EACH_TARGET
+#endif
+
+template <int Count>
+using Lanes = std::integral_constant<int, Count>;
+
+#ifdef X86_KERNELS
+template <class F>
+__attribute__((target("arch=x86-64-v4"))) void run_in_avx512(const F& f) {
+    f(Lanes<16>{});
+}
+template <class F>
+__attribute__((target("arch=x86-64-v3"))) void run_in_avx2(const F& f) {
+    f(Lanes<8>{});
+}
+inline const bool has_avx512 = __builtin_cpu_supports("x86-64-v4"), has_avx2 = __builtin_cpu_supports("x86-64-v3");
+#endif
+
+// Calls f(lanes) in the version for this processor. `lanes`: an integral constant, how many floats vector code should
+// take at a time. f must be a lambda with INLINE_LAMBDA, or it would be compiled by itself, without those vectors.
+template <class T, class F>
+void vectorised(const F& f) {
+#ifdef X86_KERNELS
+    if constexpr (std::is_same_v<T, float>) {
+        if (has_avx512) return run_in_avx512(f);
+        if (has_avx2) return run_in_avx2(f);
+    }
+#endif
+    f(Lanes<8>{});
+}
+
+// `Count` numbers that are added and multiplied lane by lane; `Unaligned`: at any address.
+template <class T, int Count>
+struct VectorOf {
+    typedef T Aligned __attribute__((vector_size(Count * sizeof(T))));
+    typedef Aligned Unaligned __attribute__((aligned(alignof(T)), may_alias));
+};
+template <class T, int Count>
+using Vector = typename VectorOf<T, Count>::Aligned;
+
+// The `Count` numbers from x on, as a vector to read or write.
+template <int Count, class T>
+ALWAYS_INLINE const typename VectorOf<T, Count>::Unaligned& lanes_at(const T* x) {
+    return *reinterpret_cast<const typename VectorOf<T, Count>::Unaligned*>(x);
+}
+template <int Count, class T>
+ALWAYS_INLINE typename VectorOf<T, Count>::Unaligned& lanes_at(T* x) {
+    return *reinterpret_cast<typename VectorOf<T, Count>::Unaligned*>(x);
+}
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Matrix products. C [M, N] = or += A [M, K] B [K, N]. Index order everywhere: row-major, last index fastest.
@@ -298,7 +330,7 @@ struct View {
     T* data;
     int stride;
     bool transposed = false;
-    bool lasting = false;  // as B: used again before it changes (KeepPacked below)
+    bool weight = false;  // as B: a model's weight, which does not change while a FrozenWeights lives
     T& operator()(int i, int j) const {
         return transposed ? data[static_cast<ptrdiff_t>(j) * stride + i] : data[static_cast<ptrdiff_t>(i) * stride + j];
     }
@@ -311,6 +343,7 @@ constexpr int sum_block = 256;
 
 enum class Store { overwrite, accumulate };
 
+// The definition of a product. The fast version below is held to it by tests.
 template <class T>
 void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int K, Store store) {
     for (int i = 0; i < M; ++i)
@@ -325,19 +358,26 @@ void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Kernels. What computes one tile of a product, for each instruction set.
+// Kernels. A kernel computes one tile of C from packed panels of A and B: a panel holds the elements of a few rows of A
+// (or columns of B), called its lines, in the order in which the kernel reads them: [k, line].
 
-// One tile of C from packed panels: a [depth, tile rows], b [depth, tile columns], depth <= sum_block. Writes (`add`:
-// adds) the upper left rows x columns of the tile to c.
-using TileFunction = void (*)(float* c, int c_stride, const void* a, const void* b, int depth, int rows, int columns,
-                              bool add);
+// Where a tile of C lies and what happens to it: the upper left rows x columns of the tile are written, or added to.
+struct Tile {
+    float* c;
+    int stride;
+    int rows, columns;
+    Store store;
+};
 
-// Copies `used` lines of `depth` elements into a panel, filling up with zeros; element (k, w) of the panel comes from
-// view(k, w) offset by (first_k, first_w). Lines are rows of A or columns of B.
-using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_w, int depth, int used);
+// Computes a tile from a [depth, tile_rows] and b [depth, tile_columns], 1 <= depth <= sum_block.
+using TileFunction = void (*)(const Tile& tile, const void* a, const void* b, int depth);
 
-// One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone: the
-// packed panels are opaque to it, so a kernel may store its elements in another format (bf16, say) by its own packing.
+// Copies `used` lines of `depth` elements into a panel and fills it up with lines of zeros. Element (k, line) of the
+// panel is view(first_k + k, first_line + line).
+using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_line, int depth, int used);
+
+// One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone, and
+// panels are opaque to it, so a kernel may store elements in another format (bf16, say) by packing functions of its own.
 struct Kernel {
     const char* name;
     // Kernels of equal arithmetic give the same bits: "fused" rounds once for a multiply-add, "plain" twice, as
@@ -348,17 +388,14 @@ struct Kernel {
     bool (*supported)();   // by this machine
     PackFunction pack_a, pack_b;
     TileFunction tile;
+
     // Bytes of panels of `lines` lines in all, `depth` elements each.
     size_t panel_bytes(int lines, int depth) const { return element_bytes * lines * depth; }
 };
 
-typedef float Float4 __attribute__((vector_size(16)));
-typedef float Float8 __attribute__((vector_size(32)));
-typedef float Float16 __attribute__((vector_size(64)));
-
 // sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so the fused form is one instruction by name.
-template <bool Fused, class Vector>
-ALWAYS_INLINE void multiply_add(Vector& sum, const Vector& a, const Vector& b) {
+template <bool Fused, class V>
+ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
 #ifdef X86_KERNELS
     if constexpr (Fused) {
         asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
@@ -368,110 +405,119 @@ ALWAYS_INLINE void multiply_add(Vector& sum, const Vector& a, const Vector& b) {
     sum += a * b;
 }
 
-template <class Vector, int Rows, int Vectors, bool Fused>
-ALWAYS_INLINE void tile_body(float* c, int c_stride, const float* a, const float* b, int depth, int rows, int columns,
-                             bool add) {
-    typedef Vector Unaligned __attribute__((aligned(4), may_alias));
-    constexpr int lanes = sizeof(Vector) / sizeof(float), tile_columns = lanes * Vectors;
-    for (int r = 0; r < rows; ++r)  // C may be far away, and is wanted only at the end
-        for (int j = 0; j < columns; j += 16) __builtin_prefetch(c + static_cast<ptrdiff_t>(r) * c_stride + j, 1);
-    Vector sum[Rows][Vectors] = {};
+// TileFunction for panels of floats: `Rows` rows of `Vectors` vectors of `Width` floats, held in registers while k runs.
+template <int Rows, int Vectors, int Width, bool Fused>
+ALWAYS_INLINE void tile_of_floats(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
+    constexpr int columns = Width * Vectors;
+    const float *a = static_cast<const float*>(a_panel), *b = static_cast<const float*>(b_panel);
+    // C may be far from the cache, and is needed only at the end.
+    for (int r = 0; r < tile.rows; ++r)
+        for (int j = 0; j < tile.columns; j += 16)
+            __builtin_prefetch(tile.c + static_cast<ptrdiff_t>(r) * tile.stride + j, 1);
+    Vector<float, Width> sum[Rows][Vectors] = {};
     for (int k = 0; k < depth; ++k) {
-        Vector row_of_b[Vectors];
+        Vector<float, Width> row_of_b[Vectors];
 #pragma GCC unroll 4
         for (int v = 0; v < Vectors; ++v) {
-            row_of_b[v] = reinterpret_cast<const Unaligned*>(b + v * lanes)[0];
-            __builtin_prefetch(b + 16 * tile_columns + v * lanes);  // in acting, B comes from memory
+            row_of_b[v] = lanes_at<Width>(b + v * Width);
+            __builtin_prefetch(b + 16 * columns + v * Width);  // with few rows of A, B comes from memory
         }
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r) {
-            const Vector element_of_a = a[r] - Vector{};  // a broadcast: x - 0 is x, also for -0
+            const Vector<float, Width> element_of_a = a[r] - Vector<float, Width>{};  // a broadcast: x - 0 is x
 #pragma GCC unroll 4
             for (int v = 0; v < Vectors; ++v) multiply_add<Fused>(sum[r][v], element_of_a, row_of_b[v]);
         }
         a += Rows;
-        b += tile_columns;
+        b += columns;
     }
-    if (rows == Rows && columns == tile_columns) {
+    if (tile.rows == Rows && tile.columns == columns) {
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r)
 #pragma GCC unroll 4
             for (int v = 0; v < Vectors; ++v) {
-                Unaligned* to = reinterpret_cast<Unaligned*>(c + static_cast<ptrdiff_t>(r) * c_stride + v * lanes);
-                *to = add ? *to + sum[r][v] : sum[r][v];
+                float* to = tile.c + static_cast<ptrdiff_t>(r) * tile.stride + v * Width;
+                lanes_at<Width>(to) = (tile.store == Store::accumulate ? lanes_at<Width>(to) + sum[r][v] : sum[r][v]);
             }
         return;
     }
-    float whole[Rows * tile_columns];
+    // The tile sticks out of C: only its upper left part is copied.
+    float whole[Rows * columns];
     std::memcpy(whole, sum, sizeof whole);
-    for (int r = 0; r < rows; ++r)
-        for (int j = 0; j < columns; ++j) {
-            float& to = c[static_cast<ptrdiff_t>(r) * c_stride + j];
-            to = add ? to + whole[r * tile_columns + j] : whole[r * tile_columns + j];
+    for (int r = 0; r < tile.rows; ++r)
+        for (int j = 0; j < tile.columns; ++j) {
+            float& to = tile.c[static_cast<ptrdiff_t>(r) * tile.stride + j];
+            to = tile.store == Store::accumulate ? to + whole[r * columns + j] : whole[r * columns + j];
         }
 }
 
 // to[j * to_stride + i] = from[i * from_stride + j] for i, j < 4.
-ALWAYS_INLINE void turn_4x4(float* to, int to_stride, const float* from, int from_stride) {
-    typedef Float4 Unaligned __attribute__((aligned(4), may_alias));
-    Float4 row[4];
-    for (ptrdiff_t i = 0; i < 4; ++i) row[i] = *reinterpret_cast<const Unaligned*>(from + i * from_stride);
-    const Float4 a = __builtin_shufflevector(row[0], row[1], 0, 4, 1, 5),
-                 b = __builtin_shufflevector(row[2], row[3], 0, 4, 1, 5),
-                 c = __builtin_shufflevector(row[0], row[1], 2, 6, 3, 7),
-                 d = __builtin_shufflevector(row[2], row[3], 2, 6, 3, 7);
-    const Float4 column[4] = {__builtin_shufflevector(a, b, 0, 1, 4, 5), __builtin_shufflevector(a, b, 2, 3, 6, 7),
-                              __builtin_shufflevector(c, d, 0, 1, 4, 5), __builtin_shufflevector(c, d, 2, 3, 6, 7)};
-    for (ptrdiff_t j = 0; j < 4; ++j) *reinterpret_cast<Unaligned*>(to + j * to_stride) = column[j];
+ALWAYS_INLINE void transpose_4x4(float* to, int to_stride, const float* from, int from_stride) {
+    Vector<float, 4> row[4];
+    for (ptrdiff_t i = 0; i < 4; ++i) row[i] = lanes_at<4>(from + i * from_stride);
+    // First pairs of elements of two rows, then those pairs: a = (00 10 01 11), b = (20 30 21 31), ...
+    const auto a = __builtin_shufflevector(row[0], row[1], 0, 4, 1, 5),
+               b = __builtin_shufflevector(row[2], row[3], 0, 4, 1, 5),
+               c = __builtin_shufflevector(row[0], row[1], 2, 6, 3, 7),
+               d = __builtin_shufflevector(row[2], row[3], 2, 6, 3, 7);
+    const ptrdiff_t stride = to_stride;
+    lanes_at<4>(to) = __builtin_shufflevector(a, b, 0, 1, 4, 5);
+    lanes_at<4>(to + stride) = __builtin_shufflevector(a, b, 2, 3, 6, 7);
+    lanes_at<4>(to + 2 * stride) = __builtin_shufflevector(c, d, 0, 1, 4, 5);
+    lanes_at<4>(to + 3 * stride) = __builtin_shufflevector(c, d, 2, 3, 6, 7);
 }
 
 // PackFunction for floats: the panel is [depth, width].
-template <int Width>
-void pack_floats(void* to, View<const float> view, int first_k, int first_w, int depth, int used) {
-    float* const panel = static_cast<float*>(to);
+inline void pack_floats(float* panel, int width, View<const float> view, int first_k, int first_line, int depth,
+                        int used) {
     if (!view.transposed) {  // the lines lie side by side: copy along them
         for (int k = 0; k < depth; ++k) {
-            const float* line = &view(first_k + k, first_w);
-            for (int w = 0; w < used; ++w) panel[k * Width + w] = line[w];  // a few dozen: no call to memcpy
-            for (int w = used; w < Width; ++w) panel[k * Width + w] = 0;
+            const float* row = &view(first_k + k, first_line);
+            for (int line = 0; line < used; ++line) panel[k * width + line] = row[line];
         }
-        return;
-    }
-    for (int w = 0; w < used; w += 4) {  // the lines lie along k: turn blocks of 4 x 4
-        const int lines = std::min(4, used - w), whole = lines == 4 ? depth / 4 * 4 : 0;
-        for (int k = 0; k < whole; k += 4)
-            turn_4x4(panel + k * Width + w, Width, &view(first_k + k, first_w + w), view.stride);
-        for (int i = 0; i < lines; ++i) {
-            const float* line = &view(first_k, first_w + w + i);
-            for (int k = whole; k < depth; ++k) panel[k * Width + w + i] = line[k];
+    } else {  // the lines lie along k: transpose blocks of 4 x 4
+        for (int first = 0; first < used; first += 4) {
+            const int lines = std::min(4, used - first), whole = lines == 4 ? depth / 4 * 4 : 0;
+            for (int k = 0; k < whole; k += 4)
+                transpose_4x4(panel + k * width + first, width, &view(first_k + k, first_line + first), view.stride);
+            for (int line = first; line < first + lines; ++line)
+                for (int k = whole; k < depth; ++k) panel[k * width + line] = view(first_k + k, first_line + line);
         }
     }
-    for (int k = 0; used < Width && k < depth; ++k)
-        for (int w = used; w < Width; ++w) panel[k * Width + w] = 0;
+    for (int k = 0; used < width && k < depth; ++k)
+        for (int line = used; line < width; ++line) panel[k * width + line] = 0;
 }
 
-// A kernel for each instruction set: the same body, another vector, compiled for its own target.
-#define KERNEL(NAME, TARGET, VECTOR, ROWS, VECTORS, FUSED, SUPPORTED)                                         \
-    TARGET inline void tile_##NAME(float* c, int c_stride, const void* a, const void* b, int depth, int rows, \
-                                   int columns, bool add) {                                                   \
-        tile_body<VECTOR, ROWS, VECTORS, FUSED>(c, c_stride, static_cast<const float*>(a),                    \
-                                                static_cast<const float*>(b), depth, rows, columns, add);     \
-    }                                                                                                         \
-    inline const Kernel kernel_##NAME = vector_kernel<ROWS, VECTORS * sizeof(VECTOR) / sizeof(float)>(        \
-        #NAME, FUSED ? "fused" : "plain", [] { return static_cast<bool>(SUPPORTED); }, tile_##NAME);
+template <int Width>
+void pack_floats_of(void* panel, View<const float> view, int first_k, int first_line, int depth, int used) {
+    pack_floats(static_cast<float*>(panel), Width, view, first_k, first_line, depth, used);
+}
 
+// The record of a kernel for floats with tiles of Rows x Columns.
 template <int Rows, int Columns>
-constexpr Kernel vector_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
-    const PackFunction pack_a = pack_floats<Rows>, pack_b = pack_floats<Columns>;
-    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_a, pack_b, tile};
+constexpr Kernel float_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
+    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_floats_of<Rows>, pack_floats_of<Columns>,
+            tile};
 }
 
 #ifdef X86_KERNELS
-KERNEL(avx512, __attribute__((target("avx512f"))), Float16, 12, 2, true, __builtin_cpu_supports("avx512f"))
-KERNEL(avx2, __attribute__((target("avx2,fma"))), Float8, 6, 2, true,
-       __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+__attribute__((target("avx512f"))) inline void tile_avx512(const Tile& tile, const void* a, const void* b, int depth) {
+    tile_of_floats<12, 2, 16, true>(tile, a, b, depth);
+}
+inline const Kernel kernel_avx512 = float_kernel<12, 32>(
+    "avx512", "fused", [] { return __builtin_cpu_supports("avx512f") != 0; }, tile_avx512);
+
+__attribute__((target("avx2,fma"))) inline void tile_avx2(const Tile& tile, const void* a, const void* b, int depth) {
+    tile_of_floats<6, 2, 8, true>(tile, a, b, depth);
+}
+inline const Kernel kernel_avx2 = float_kernel<6, 16>(
+    "avx2", "fused", [] { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }, tile_avx2);
 #endif
-KERNEL(portable, , Float4, 4, 2, false, true)
+inline void tile_portable(const Tile& tile, const void* a, const void* b, int depth) {
+    tile_of_floats<4, 2, 4, false>(tile, a, b, depth);
+}
+inline const Kernel kernel_portable = float_kernel<4, 8>(
+    "portable", "plain", [] { return true; }, tile_portable);
 
 // All kernels of this program, best first. A kernel of reduced precision would stand here as one more record.
 inline const Kernel* const kernels[] = {
@@ -495,8 +541,8 @@ inline const Kernel* find_kernel(const std::string& name) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Products from tiles: packing and sharing out.
 
-// Scratch memory on cache lines (a vector load that straddles two costs two), grown to what was once asked for. What is
-// in it lasts until more is asked for.
+// Scratch memory on cache lines (a vector load that straddles two costs two). It grows to the largest size asked for;
+// its contents last until room() is called again.
 struct Buffer {
     struct alignas(64) Line {
         char bytes[64];
@@ -508,164 +554,207 @@ struct Buffer {
     }
 };
 
+// The packed form of weights, for as long as a FrozenWeights lives.
+struct PackedWeights {
+    struct Entry {
+        Buffer panels;
+        bool valid = false;
+    };
+    bool frozen = false;
+    std::map<std::tuple<const float*, int, bool, int, int>, Entry> entries;  // by data, stride, transposed, K, N
+};
+
 // Threads, kernel and scratch memory: what every operation below needs in order to run.
 struct Compute {
-    static constexpr int block_rows = 192;            // of A, that a task packs: for a core's second cache
-    static constexpr size_t stretch_bytes = 4 << 20;  // of B that is packed at a time: for the cache that cores share
+    static constexpr int block_rows = 192;            // of A, that a task packs: fits a core's second cache
+    static constexpr size_t stretch_bytes = 4 << 20;  // of B that is packed at a time: fits the cache that cores share
     const Kernel& kernel;
     Threads threads;
-    Buffer packed_b;              // a stretch of B, in panels of tile_columns
+    Buffer packed_b;  // a stretch of B, in panels
+    PackedWeights packed_weights;
     std::vector<Buffer> scratch;  // one per worker, for a task: a block of A in panels, a head's rows
-    Buffer sums;                  // of sums_of_blocks
-    struct Kept {
-        Buffer packed;
-        uint64_t period = 0;
-    };
-    std::map<std::tuple<const float*, int, bool, int, int>, Kept> kept;  // lasting Bs: data, stride, transposed, K, N
-    uint64_t period = 0, periods = 0;  // of time in which a lasting B stays what it is; 0: not now
+    Buffer sums;                  // of block_sums
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
           scratch(static_cast<size_t>(thread_count)) {}
 };
 
-// For as long as it lives, no matrix that is called lasting may change: each is packed once.
-struct KeepPacked {
-    Compute& compute;
-    explicit KeepPacked(Compute& c) : compute(c) { compute.period = ++compute.periods; }
-    ~KeepPacked() { compute.period = 0; }
-    KeepPacked(const KeepPacked&) = delete;
-    KeepPacked& operator=(const KeepPacked&) = delete;
+// While one lives, no weight may change (View::weight): products pack each weight once and use its panels again.
+struct FrozenWeights {
+    PackedWeights& packed;
+    explicit FrozenWeights(Compute& compute) : packed(compute.packed_weights) {
+        for (auto& [key, entry] : packed.entries) entry.valid = false;
+        packed.frozen = true;
+    }
+    ~FrozenWeights() { packed.frozen = false; }
+    FrozenWeights(const FrozenWeights&) = delete;
+    FrozenWeights& operator=(const FrozenWeights&) = delete;
 };
-
-template <class N>
-N divide_up(N n, std::type_identity_t<N> by) {
-    return (n + by - 1) / by;
-}
 
 // Rows and columns of C that a task works on.
 struct Block {
     int first_row, end_row, first_column, end_column;
 };
 
+// What is done to each element of C after its last addition, while it is in a core's cache: the bias of its column is
+// added, then negative values become 0. The slope of ReLU at 0 is 0, as in PyTorch; NaN stays.
+template <class T>
+struct Epilogue {
+    const T* bias = nullptr;  // [N]; null: none
+    bool relu = false;
+};
+
+template <class T>
+void apply_epilogue(View<T> c, const Epilogue<T>& epilogue, const Block& block) {
+    if (!epilogue.bias && !epilogue.relu) return;
+    vectorised<T>([&](auto) INLINE_LAMBDA {
+        for (int i = block.first_row; i < block.end_row; ++i) {
+            T* row = &c(i, 0);
+            for (int j = block.first_column; epilogue.bias && j < block.end_column; ++j) row[j] += epilogue.bias[j];
+            for (int j = block.first_column; epilogue.relu && j < block.end_column; ++j)
+                row[j] = row[j] < 0 ? T(0) : row[j];
+        }
+    });
+}
+
 // Packs lines [first_line, end_line) of A or B, k in [first_k, first_k + depth), into panels of `width` lines: along
-// the lines where these run along memory, else 32 k of all panels at a time, which lie side
-// by side.
+// the lines where these run along memory, else 32 k of all panels at a time, which lie side by side.
 inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char* to, View<const float> view,
                         int first_k, int depth, int first_line, int end_line) {
     const int slice = view.transposed ? depth : 32;
     for (int k = 0; k < depth; k += slice) {
         char* panel = to + kernel.panel_bytes(width, k);
-        for (int line = first_line; line < end_line; line += width, panel += kernel.panel_bytes(width, depth))
+        for (int line = first_line; line < end_line; line += width) {
             pack(panel, view, first_k + k, line, std::min(slice, depth - k), std::min(width, end_line - line));
+            panel += kernel.panel_bytes(width, depth);
+        }
     }
 }
 
-// The product of a block of rows with panels of B, for one step of k.
-inline void matmul_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a,
-                         const char* packed_b, const Block& block, int first_k, int depth, bool add) {
+// C's block = or += A's rows times panels of B, for `depth` k from first_k on.
+inline void multiply_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a,
+                           const char* packed_b, const Block& block, int first_k, int depth, Store store) {
     char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, sum_block));
-    const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // panels of A run along k
+    const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // the lines of A are its rows
     pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
                 block.end_row);
     for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns)
-        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows)
-            kernel.tile(&c(i, j), c.stride, packed_a + kernel.panel_bytes(i - block.first_row, depth),
-                        packed_b + kernel.panel_bytes(j, depth), depth, std::min(kernel.tile_rows, block.end_row - i),
-                        std::min(kernel.tile_columns, block.end_column - j), add);
+        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows) {
+            const Tile tile = {&c(i, j), c.stride, std::min(kernel.tile_rows, block.end_row - i),
+                               std::min(kernel.tile_columns, block.end_column - j), store};
+            kernel.tile(tile, packed_a + kernel.panel_bytes(i - block.first_row, depth),
+                        packed_b + kernel.panel_bytes(j, depth), depth);
+        }
 }
 
-struct Nothing {
-    void operator()(const Block&) const {}
+// How C is cut into blocks for tasks: blocks of rows; for a wide C with few rows also of columns. Blocks are as equal
+// as whole tiles allow.
+struct Blocks {
+    int M, N, tile_rows, tile_columns;
+    int tiles, panels;  // of M rows and of N columns
+    int row_blocks, column_blocks;
+
+    Blocks(const Kernel& kernel, int threads, int rows, int columns)
+        : M(rows),
+          N(columns),
+          tile_rows(kernel.tile_rows),
+          tile_columns(kernel.tile_columns),
+          tiles(divide_up(rows, kernel.tile_rows)),
+          panels(divide_up(columns, kernel.tile_columns)) {
+        const int fewest = std::max(divide_up(tiles, Compute::block_rows / tile_rows), 4);
+        row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
+        column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
+    }
+    int count() const { return row_blocks * column_blocks; }
+    Block operator[](int task) const {
+        const int i = task / column_blocks, j = task % column_blocks;
+        return {first_row(i), first_row(i + 1), first_column(j), first_column(j + 1)};
+    }
+    int first_row(int block) const { return std::min(M, tiles * block / row_blocks * tile_rows); }
+    int first_column(int block) const { return std::min(N, panels * block / column_blocks * tile_columns); }
 };
 
-// The fast version of matmul_plain: same definition, panels packed for the kernel's tiles.
-// after(block) is called for every part of C after its last addition, while it is in a core's cache.
-template <class After = Nothing>
-void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K, Store store,
-            After after = {}) {
+// The fast version of matmul_plain, then the epilogue. B is packed in steps of sum_block k, as many at a time as a
+// stretch holds; a frozen weight is one stretch and is packed once.
+inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
+                   Store store, Epilogue<float> epilogue = {}) {
     if (M == 0 || N == 0) return;
     if (K == 0) {  // an empty sum
-        for (int i = 0; store == Store::overwrite && i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
-        return after(Block{0, M, 0, N});
+        if (store == Store::overwrite)
+            for (int i = 0; i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
+        return apply_epilogue(c, epilogue, {0, M, 0, N});
     }
     const Kernel& kernel = compute.kernel;
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
-    // Tasks: blocks of rows; for a wide C and few rows, also of columns. As equal as tiles can be shared out.
-    const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
-    const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4),
-              row_blocks = std::min(tiles, divide_up(fewest, compute.threads.count()) * compute.threads.count());
-    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
-    // B in stretches of k, a stretch in steps of the kernel's depth, a step in panels. A lasting B is one stretch.
-    const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, sum_block));
-    Compute::Kept* const kept =
-        b.lasting && compute.period > 0 ? &compute.kept[{b.data, b.stride, b.transposed, K, N}] : nullptr;
-    const int all_steps = divide_up(K, sum_block), fitting = static_cast<int>(Compute::stretch_bytes / step_bytes),
-              steps = kept ? all_steps : std::clamp(fitting, 1, all_steps);
-    Buffer& buffer = kept ? kept->packed : compute.packed_b;
-    char* const packed = buffer.room(step_bytes * static_cast<size_t>(steps));
-    const bool packed_before = kept && std::exchange(kept->period, compute.period) == compute.period;
-    const auto packed_b = [&](int step) { return packed + static_cast<size_t>(step) * step_bytes; };
-    for (int first_k = 0; first_k < K; first_k += steps * sum_block) {
-        const int end_k = std::min(K, first_k + steps * sum_block);
+    const Blocks blocks(kernel, compute.threads.count(), M, N);
+    PackedWeights::Entry* const cached = b.weight && compute.packed_weights.frozen
+                                             ? &compute.packed_weights.entries[{b.data, b.stride, b.transposed, K, N}]
+                                             : nullptr;
+    const bool packed_before = cached && cached->valid;
+    const size_t step_bytes = kernel.panel_bytes(blocks.panels * kernel.tile_columns, std::min(K, sum_block));
+    const int all_steps = divide_up(K, sum_block);
+    const int fitting_steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, all_steps);
+    const int stretch = (cached ? all_steps : fitting_steps) * sum_block;  // k at a time
+    char* const packed =
+        (cached ? cached->panels : compute.packed_b).room(step_bytes * divide_up(std::min(K, stretch), sum_block));
+    const int panels_a_task = std::max(1, blocks.panels / 8);
+    const int tasks_a_step = divide_up(blocks.panels, panels_a_task);
+
+    for (int first_k = 0; first_k < K; first_k += stretch) {
+        const int end_k = std::min(K, first_k + stretch);
         const auto depth_at = [&](int k) { return std::min(sum_block, end_k - k); };
-        const int at_once = std::max(1, panels / 8), batches = divide_up(panels, at_once);  // panels that a task packs
+        const auto pack_some_panels = [&](int task, int) {
+            const int step = task / tasks_a_step, k = first_k + step * sum_block;
+            const int line = task % tasks_a_step * panels_a_task * kernel.tile_columns;
+            pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
+                        packed + step * step_bytes + kernel.panel_bytes(line, depth_at(k)), b, k, depth_at(k), line,
+                        std::min(N, line + panels_a_task * kernel.tile_columns));
+        };
         if (!packed_before)
-            compute.threads.run(
-                divide_up(end_k - first_k, sum_block) * batches,
-                [&](int task, int) {
-                    const int step = task / batches, k = first_k + step * sum_block,
-                              first = task % batches * at_once * kernel.tile_columns;
-                    pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
-                                packed_b(step) + kernel.panel_bytes(first, depth_at(k)), b, k, depth_at(k), first,
-                                std::min(N, first + at_once * kernel.tile_columns));
-                },
-                serial);
-        compute.threads.run(
-            row_blocks * column_blocks,
-            [&](int task, int worker) {
-                const int i = task / column_blocks, j = task % column_blocks;
-                const auto row = [&](int n) { return std::min(M, tiles * n / row_blocks * kernel.tile_rows); };
-                const auto column = [&](int n) {
-                    return std::min(N, panels * n / column_blocks * kernel.tile_columns);
-                };
-                const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
-                for (int k = first_k; k < end_k; k += sum_block)
-                    matmul_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a,
-                                 packed_b((k - first_k) / sum_block), block, k, depth_at(k),
-                                 k > 0 || store == Store::accumulate);
-                if (end_k == K) after(block);
-            },
-            serial);
+            compute.threads.run(divide_up(end_k - first_k, sum_block) * tasks_a_step, pack_some_panels, serial);
+        const auto multiply = [&](int task, int worker) {
+            const Block block = blocks[task];
+            for (int k = first_k; k < end_k; k += sum_block)
+                multiply_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a,
+                               packed + (k - first_k) / sum_block * step_bytes, block, k, depth_at(k),
+                               k > 0 ? Store::accumulate : store);
+            if (end_k == K) apply_epilogue(c, epilogue, block);
+        };
+        compute.threads.run(blocks.count(), multiply, serial);
     }
+    if (cached) cached->valid = true;
 }
 
 // In double, for checks alone.
-template <class After = Nothing>
-void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
-            Store store, After after = {}) {
+inline void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
+                   Store store, Epilogue<double> epilogue = {}) {
     compute.threads.run(M, [&](int i, int) {
         matmul_plain<double>({&c(i, 0), c.stride}, {&a(i, 0), a.stride, a.transposed}, b, 1, N, K, store);
     });
-    after(Block{0, M, 0, N});
+    apply_epilogue(c, epilogue, {0, M, 0, N});
 }
 
-// y_r = x . row_r for up to four rows [n], `stride` apart. The order of additions: 16 lanes (Width of them a vector),
-// folded in a fixed tree, in which the rows share vectors, then what is left over: faster than one chain, and as
-// reproducible.
+// ---------------------------------------------------------------------------------------------------------------------
+// Dot products.
+
+// y_r = x . row_r for the rows r < Rows <= 4 of rows [Rows, n], which lie `stride` apart. The order of additions is
+// part of the definition: lane i mod 16 sums the products i in order; the 16 lanes are folded in halves; the products
+// beyond the last 16 are summed in order and added at the end. A sum in lanes is faster than one chain of additions.
+//
+//     lanes   0 1 2 ... 15     16 sums of a row
+//     fold    l + (l + 8)      8 of a row, then with 4, 2 and 1 for 8: 4, 2 and 1 of a row
+//
+// From the second fold on, two rows, then four, share a vector: [a b] = [a low, b low] + [a high, b high].
 template <int Rows, int Width, class T>
 ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdiff_t n) {
-    typedef T Lanes __attribute__((vector_size(Width * sizeof(T))));
-    typedef T Eight __attribute__((vector_size(8 * sizeof(T))));
-    typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
-    Lanes sum[4][16 / Width] = {};
-    Eight eight[4], four[2];
+    Vector<T, Width> sum[4][16 / Width] = {};
     ptrdiff_t i = 0;
     for (; i + 16 <= n; i += 16)
         for (ptrdiff_t r = 0; r < Rows; ++r)
             for (ptrdiff_t h = 0; h < 16; h += Width)
-                sum[r][h / Width] += *reinterpret_cast<const Unaligned*>(x + i + h) *
-                                     *reinterpret_cast<const Unaligned*>(rows + r * stride + i + h);
+                sum[r][h / Width] += lanes_at<Width>(x + i + h) * lanes_at<Width>(rows + r * stride + i + h);
+    Vector<T, 8> eight[4], four_of_two[2];
     for (size_t r = 0; r < 4; ++r)
         if constexpr (Width == 16)
             eight[r] = __builtin_shufflevector(sum[r][0], sum[r][0], 0, 1, 2, 3, 4, 5, 6, 7) +
@@ -673,24 +762,27 @@ ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdi
         else
             eight[r] = sum[r][0] + sum[r][1];
     for (size_t pair = 0; pair < 2; ++pair) {
-        const Eight &a = eight[2 * pair], &b = eight[2 * pair + 1];
-        four[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) +
-                     __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+        const Vector<T, 8>&a = eight[2 * pair], &b = eight[2 * pair + 1];
+        four_of_two[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) +
+                            __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
     }
-    const Eight two = __builtin_shufflevector(four[0], four[1], 0, 1, 4, 5, 8, 9, 12, 13) +
-                      __builtin_shufflevector(four[0], four[1], 2, 3, 6, 7, 10, 11, 14, 15);
-    const auto one = __builtin_shufflevector(two, two, 0, 2, 4, 6) + __builtin_shufflevector(two, two, 1, 3, 5, 7);
+    const Vector<T, 8>&a = four_of_two[0], &b = four_of_two[1];
+    const Vector<T, 8> two_of_four = __builtin_shufflevector(a, b, 0, 1, 4, 5, 8, 9, 12, 13) +
+                                     __builtin_shufflevector(a, b, 2, 3, 6, 7, 10, 11, 14, 15);
+    const auto one_of_four = __builtin_shufflevector(two_of_four, two_of_four, 0, 2, 4, 6) +
+                             __builtin_shufflevector(two_of_four, two_of_four, 1, 3, 5, 7);
     for (ptrdiff_t r = 0; r < Rows; ++r) {
         T rest = 0;
         for (ptrdiff_t j = i; j < n; ++j) rest += x[j] * rows[r * stride + j];
-        y[r] = one[r] + rest;
+        y[r] = one_of_four[r] + rest;
     }
 }
 
-template <class T>
+// a . b, of [n] each, in the same order. Width: inside vectorised(), its number of lanes.
+template <int Width = 8, class T>
 ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
     T y;
-    wide_vectors ? dots<1, 16>(&y, a, b, 0, n) : dots<1, 8>(&y, a, b, 0, n);
+    dots<1, Width>(&y, a, b, 0, n);
     return y;
 }
 
@@ -703,17 +795,18 @@ struct Tensor {
     T* value = nullptr;     // [rows, columns]
     T* gradient = nullptr;  // [rows, columns], accumulated
     int rows = 0, columns = 0;
-    bool* empty = nullptr;  // while it says so, nothing has been added to the gradient, and it holds no numbers
+    bool* untouched = nullptr;  // true until the first addition to the gradient, which is not initialised until then
     size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
 };
 
-// How to store the next addition to x's gradient: the first overwrites, all of it. To be asked once per addition.
+// How the caller must store its contribution to x's gradient: the first one overwrites all of it, which saves a pass of
+// zeros. To be called once per contribution.
 template <class T>
 Store next_store(Tensor<T> x) {
-    return x.empty && std::exchange(*x.empty, false) ? Store::overwrite : Store::accumulate;
+    return x.untouched && std::exchange(*x.untouched, false) ? Store::overwrite : Store::accumulate;
 }
 
-// x's gradient, to be added to.
+// x's gradient, to be added to: zeros before the first contribution.
 template <class T>
 T* gradient_of(Tensor<T> x) {
     if (next_store(x) == Store::overwrite) std::fill_n(x.gradient, x.size(), T(0));
@@ -727,12 +820,15 @@ class Arena {
     // `bytes` bytes aligned to 64, not initialised, valid until reset().
     void* take(size_t bytes) {
         bytes = (bytes + 63) / 64 * 64;
-        while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) ++chunk_, used_ = 0;
+        while (chunk_ < chunks_.size() && used_ + bytes > chunks_[chunk_].bytes) {
+            ++chunk_;
+            used_ = 0;
+        }
         if (chunk_ == chunks_.size()) add_chunk(std::max(bytes, size_t{1} << 20));
         used_ += bytes;
         return chunks_[chunk_].lines.get() + (used_ - bytes) / sizeof(Buffer::Line);
     }
-    // Joins the chunks into one, or batches of ever new shapes would each leave theirs behind.
+    // Takes all pieces back. Several chunks become one, or batches of ever new shapes would each leave theirs behind.
     void reset() {
         size_t total = 0;
         for (const Chunk& chunk : chunks_) total += chunk.bytes;
@@ -748,7 +844,7 @@ class Arena {
         std::unique_ptr<Buffer::Line[]> lines;
         size_t bytes;
     };
-    void add_chunk(size_t bytes) {  // not initialised, as `new` without parentheses leaves it
+    void add_chunk(size_t bytes) {  // `new` without parentheses leaves the memory uninitialised
         chunks_.push_back({std::unique_ptr<Buffer::Line[]>(new Buffer::Line[bytes / sizeof(Buffer::Line)]), bytes});
     }
     std::vector<Chunk> chunks_;
@@ -761,23 +857,23 @@ template <class T>
 struct Tape {
     Compute& compute;
     bool recording = true;  // false: acting; no gradients, no dropout
-    size_t part = 0;        // which part of a batch this tape works on: each has its own dropout masks
+    size_t part = 0;        // the number of this part of a batch: each part has its own dropout masks
     size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
-    uint64_t dropout_step = 0;  // the update: a fresh mask for each
-    // Told of each layer's output as soon as it is there. Empty: no one watches.
+    uint64_t dropout_step = 0;  // the update: fresh masks for each
+    // Called with each layer's output as soon as it is computed; may be empty.
     std::function<void(const std::string& name, const Tensor<T>& output)> watch;
 
     explicit Tape(Compute& c) : compute(c) {}
 
-    // A result; its gradient, if recorded, is empty.
+    // A result [rows, columns], not initialised; its gradient, if recorded, is untouched.
     Tensor<T> make(int rows, int columns) {
         Tensor<T> x = {nullptr, nullptr, rows, columns};
         x.value = scratch<T>(x.size());
         if (recording) {
             x.gradient = scratch<T>(x.size());
-            x.empty = scratch<bool>(1);
-            *x.empty = true;
+            x.untouched = scratch<bool>(1);
+            *x.untouched = true;
         }
         return x;
     }
@@ -785,7 +881,7 @@ struct Tape {
     // Where this tape adds up the gradient of a parameter.
     T* gradient(Tensor<T> parameter) const { return parameter.gradient + block * parameter.size(); }
 
-    // Shows `output` to whoever watches.
+    // Shows a layer's output to watch(), and returns it.
     Tensor<T> show(const std::string& name, Tensor<T> output) const {
         if (watch) watch(name, output);
         return output;
@@ -800,26 +896,35 @@ struct Tape {
         return x;
     }
 
+    // An array that lasts until reset(), for backward steps to read.
+    template <class Element>
+    const Element* keep(const std::vector<Element>& x) {
+        Element* copy = scratch<Element>(x.size());
+        std::copy(x.begin(), x.end(), copy);
+        return copy;
+    }
+
+    // [count] elements, not initialised, valid until reset().
     template <class Element>
     Element* scratch(size_t count) {
         return static_cast<Element*>(arena_.take(count * sizeof(Element)));
     }
 
-    // Keeps `step` for backward(), which takes it if anything has been added to the gradient of its result. It is
+    // Keeps `step` for backward(), which runs it if anything has been added to the gradient of its result. It is
     // copied into the arena, so it may hold views and numbers only.
     template <class Step>
     void on_backward(Tensor<T> result, Step step) {
         static_assert(std::is_trivially_destructible_v<Step>);
         if (!recording) return;
-        steps_.push_back(
-            {[](void* s) { (*static_cast<Step*>(s))(); }, new (arena_.take(sizeof(Step))) Step(step), result.empty});
+        const auto call = [](void* s) { (*static_cast<Step*>(s))(); };
+        steps_.push_back({call, new (arena_.take(sizeof(Step))) Step(step), result.untouched});
     }
 
     // d(loss)/d(everything recorded), for a loss [1, 1].
     void backward(Tensor<T> loss) {
         *gradient_of(loss) = 1;
         for (size_t i = steps_.size(); i-- > 0;)
-            if (!steps_[i].empty || !*steps_[i].empty) steps_[i].call(steps_[i].step);
+            if (!steps_[i].untouched || !*steps_[i].untouched) steps_[i].call(steps_[i].step);
     }
 
     // Forgets all tensors made so far.
@@ -832,14 +937,14 @@ struct Tape {
     struct Step {
         void (*call)(void*);
         void* step;
-        const bool* empty;
+        const bool* untouched;
     };
     Arena arena_;
     std::vector<Step> steps_;
 };
 
 // Shares rows [0, rows) out in blocks; f(begin, end, worker) must treat each row alone. `work`: about how many
-// operations a row.
+// operations a row. Little work in all is done by the calling thread.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
     const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
@@ -851,25 +956,30 @@ void for_rows(Compute& compute, int rows, int work, F&& f) {
 // to[j] += sum over rows of from[row, j], rows `stride` apart: each column alone, in order of rows.
 template <class T>
 void add_column_sums(Compute& compute, T* to, const T* from, int rows, int columns, ptrdiff_t stride) {
-    for_rows(compute, divide_up(columns, 64), rows * 64, [=](int begin, int end, int) {
+    constexpr int group = 64;  // columns
+    for_rows(compute, divide_up(columns, group), rows * group, [=](int begin, int end, int) {
         for (int row = 0; row < rows; ++row)
-            for (int j = begin * 64; j < std::min(columns, end * 64); ++j) to[j] += from[row * stride + j];
+            for (int j = begin * group; j < std::min(columns, end * group); ++j) to[j] += from[row * stride + j];
     });
 }
 
 // Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its
-// block of rows_a_sum rows. Returns the blocks' sums, one after the other, for add_column_sums; they last until the
+// block of rows_a_sum rows. Returns the sums of all blocks, [blocks, columns], for add_column_sums; they last until the
 // next call.
 constexpr int rows_a_sum = 64;
 template <class T, class F>
-const T* sums_of_blocks(Compute& compute, int rows, int columns, F&& f) {
+const T* block_sums(Compute& compute, int rows, int columns, const F& f) {
     const int blocks = divide_up(rows, rows_a_sum);
-    const size_t size = static_cast<size_t>(blocks) * static_cast<size_t>(columns);
-    T* const sums = reinterpret_cast<T*>(compute.sums.room(size * sizeof(T)));
+    T* const sums = reinterpret_cast<T*>(compute.sums.room(sizeof(T) * blocks * columns));
     for_rows(compute, blocks, 8 * rows_a_sum * columns, [&](int begin, int end, int) {
-        std::fill(sums + static_cast<ptrdiff_t>(begin) * columns, sums + static_cast<ptrdiff_t>(end) * columns, T(0));
-        for (int row = begin * rows_a_sum; row < std::min(rows, end * rows_a_sum); ++row)
-            f(row, sums + static_cast<ptrdiff_t>(row / rows_a_sum) * columns);
+        vectorised<T>([&](auto lanes) INLINE_LAMBDA {
+            for (int block = begin; block < end; ++block) {
+                T* const sum = sums + static_cast<ptrdiff_t>(block) * columns;
+                std::fill_n(sum, columns, T(0));
+                const int end_row = std::min(rows, (block + 1) * rows_a_sum);
+                for (int row = block * rows_a_sum; row < end_row; ++row) f(lanes, row, sum);
+            }
+        });
     });
     return sums;
 }
@@ -888,88 +998,66 @@ struct Affine {
     Layout layout;
 };
 
-// What may follow a sum, element by element, while it is still in a core's cache: forward(y, row, begin, end) finishes
-// columns [begin, end) of a row y of the result, backward(dy, y, row, columns) turns that row's gradient, in place,
-// into the sum's; begin_backward() comes before that.
-struct Identity {
-    void begin_backward() {}
-    template <class T>
-    ALWAYS_INLINE void forward(T*, int, int, int) const {}
-    template <class T>
-    ALWAYS_INLINE void backward(T*, const T*, int, int) const {}
-};
+enum class Activation { none, relu };
 
-// max(y, 0). The slope at 0 is 0, as in PyTorch; NaN stays.
-struct Relu {
-    void begin_backward() {}
-    template <class T>
-    ALWAYS_INLINE void forward(T* y, int, int begin, int end) const {
-        for (int j = begin; j < end; ++j) y[j] = y[j] < 0 ? T(0) : y[j];
-    }
-    template <class T>
-    ALWAYS_INLINE void backward(T* dy, const T* y, int, int columns) const {
-        for (int j = 0; j < columns; ++j) dy[j] = y[j] > 0 ? dy[j] : T(0);
-    }
-};
-
-// finish(x W + b) of x [n, in], columns [first, first + count) of it: y [n, count].
-template <class T, class Finish = Identity>
-Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count, Finish finish = {}) {
+// activation(x W + b) of x [n, in], output columns [first, first + count) alone: y [n, count].
+template <class T>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count,
+                 Activation activation = Activation::none) {
     const Tensor<T> w = affine.weight, y = tape.make(x.rows, count);
-    const T* bias = affine.bias.value + first;
-    const bool transposed = affine.layout == Layout::out_in;
+    const bool transposed = affine.layout == Layout::out_in, relu = activation == Activation::relu;
     const ptrdiff_t offset = transposed ? static_cast<ptrdiff_t>(first) * w.columns : first;
     Compute& compute = tape.compute;
-    const auto row_of = [count](T* data, int row) { return data + static_cast<ptrdiff_t>(row) * count; };
-    const auto finish_sums = [=](const Block& block) EACH_TARGET {
-        for (int row = block.first_row; row < block.end_row; ++row) {
-            T* sums = row_of(y.value, row);
-            for (int j = block.first_column; j < block.end_column; ++j) sums[j] += bias[j];
-            finish.forward(sums, row, block.first_column, block.end_column);
-        }
-    };
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed, true},
-           x.rows, count, x.columns, Store::overwrite, finish_sums);
+           x.rows, count, x.columns, Store::overwrite, {affine.bias.value + first, relu});
     T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
-    tape.on_backward(y, [=, &compute]() mutable {
-        finish.begin_backward();
-        const T* sums = sums_of_blocks<T>(compute, y.rows, count, [=](int row, T* sum) EACH_TARGET {
-            T* dy = row_of(y.gradient, row);
-            finish.backward(dy, row_of(y.value, row), row, count);
+    tape.on_backward(y, [=, &compute] {
+        // db += sum over rows of dy, which becomes the gradient before the activation on the way.
+        const T* sums = block_sums<T>(compute, y.rows, count, [=](auto, ptrdiff_t row, T* sum) INLINE_LAMBDA {
+            T* const dy = y.gradient + row * count;
+            const T* const out = y.value + row * count;
+            if (relu)
+                for (int j = 0; j < count; ++j) dy[j] = out[j] > 0 ? dy[j] : T(0);
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
         const View<const T> dy = {y.gradient, count}, in = {x.value, x.columns};
+        const View<const T> dy_transposed = {y.gradient, count, true}, in_transposed = {x.value, x.columns, true};
         if (x.gradient)  // dx += dy W^T
             matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
                    x.rows, x.columns, count, next_store(x));
-        const auto [a, b] = transposed ? std::pair(dy, in) : std::pair(in, dy);  // dW^T += dy^T x, or dW += x^T dy
-        matmul(compute, View<T>{dw, w.columns}, {a.data, a.stride, true}, b, a.stride, b.stride, x.rows,
-               Store::accumulate);
+        const View<T> d_weight = {dw, w.columns};
+        if (transposed)  // dW^T += dy^T x
+            matmul(compute, d_weight, dy_transposed, in, count, x.columns, x.rows, Store::accumulate);
+        else  // dW += x^T dy
+            matmul(compute, d_weight, in_transposed, dy, x.columns, count, x.rows, Store::accumulate);
     });
     return y;
 }
 
-template <class T, class Finish = Identity>
-Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Finish finish = {}) {
-    return linear(tape, x, affine, 0, affine.bias.columns, finish);
+template <class T>
+Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation activation = Activation::none) {
+    return linear(tape, x, affine, 0, affine.bias.columns, activation);
 }
 
-// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row, and the gradients back; no list: rows 0, 1, ...
+// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row; a null list names rows 0, 1, ...
+// Backward: from's gradient at from_rows[i] += to's gradient at to_rows[i].
 template <class T>
-void add_named_rows(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows, int count) {
+void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows,
+                       int count) {
     const ptrdiff_t d = to.columns;
-    const auto each = [=](auto&& f) {  // f(row of to, row of from)
-        for (ptrdiff_t i = 0; i < count; ++i) f((to_rows ? to_rows[i] : i) * d, (from_rows ? from_rows[i] : i) * d);
-    };
-    each([=](ptrdiff_t a, ptrdiff_t b) {
-        for (ptrdiff_t j = 0; j < d; ++j) to.value[a + j] += from.value[b + j];
-    });
+    for (ptrdiff_t i = 0; i < count; ++i) {
+        T* const sum = to.value + (to_rows ? to_rows[i] : i) * d;
+        const T* const row = from.value + (from_rows ? from_rows[i] : i) * d;
+        for (ptrdiff_t j = 0; j < d; ++j) sum[j] += row[j];
+    }
     tape.on_backward(to, [=] {
         T* const gradient = gradient_of(from);
-        each([=](ptrdiff_t a, ptrdiff_t b) {
-            for (ptrdiff_t j = 0; j < d; ++j) gradient[b + j] += to.gradient[a + j];
-        });
+        for (ptrdiff_t i = 0; i < count; ++i) {
+            T* const sum = gradient + (from_rows ? from_rows[i] : i) * d;
+            const T* const row = to.gradient + (to_rows ? to_rows[i] : i) * d;
+            for (ptrdiff_t j = 0; j < d; ++j) sum[j] += row[j];
+        }
     });
 }
 
@@ -978,7 +1066,7 @@ template <class T>
 Tensor<T> select_rows(Tape<T>& tape, Tensor<T> x, const int* rows, int count) {
     const Tensor<T> y = tape.make(count, x.columns);
     std::fill_n(y.value, y.size(), T(0));
-    add_named_rows(tape, y, nullptr, x, rows, count);
+    add_rows_by_index(tape, y, nullptr, x, rows, count);
     return y;
 }
 
@@ -987,45 +1075,46 @@ struct Norm {
     Tensor<T> weight, bias;  // [1, d]
 };
 
-// LayerNorm over the columns of x [n, d]: y = finish((x - mean) / sqrt(variance + 1e-5) * weight + bias), variance with
-// 1/d.
-template <class T, class Finish = Identity>
-Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish finish = {}) {
+// LayerNorm over the columns of x [n, d]: y = (x - mean) / sqrt(variance + 1e-5) * weight + bias, variance with 1/d.
+template <class T>
+Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
     const int d = x.columns;
     const Tensor<T> y = tape.make(x.rows, d), weight = norm.weight, bias = norm.bias;
     T* means = tape.template scratch<T>(static_cast<size_t>(x.rows));   // [n]
     T* scales = tape.template scratch<T>(static_cast<size_t>(x.rows));  // [n] 1 / sqrt(variance + 1e-5)
-    T* ones = tape.template scratch<T>(static_cast<size_t>(d));         // [d]
+    T* ones = tape.template scratch<T>(static_cast<size_t>(d));         // [d]: a sum is a dot product with ones
     std::fill_n(ones, d, T(1));
     Compute& compute = tape.compute;
-    for_rows(compute, x.rows, 8 * d, [=](int begin, int end, int) EACH_TARGET {
-        for (ptrdiff_t row = begin; row < end; ++row) {
-            const T* in = x.value + row * d;
-            T* out = y.value + row * d;
-            const T mean = means[row] = dot(in, ones, d) / T(d);
-            for (int j = 0; j < d; ++j) out[j] = in[j] - mean;
-            const T scale = scales[row] = T(1) / std::sqrt(dot(out, out, d) / T(d) + T(1e-5));
-            for (int j = 0; j < d; ++j) out[j] = out[j] * scale * weight.value[j] + bias.value[j];
-            finish.forward(out, static_cast<int>(row), 0, d);
-        }
+    for_rows(compute, x.rows, 8 * d, [=](int begin, int end, int) {
+        vectorised<T>([=](auto lanes) INLINE_LAMBDA {
+            for (ptrdiff_t row = begin; row < end; ++row) {
+                const T* in = x.value + row * d;
+                T* out = y.value + row * d;
+                const T mean = dot<lanes>(in, ones, d) / T(d);
+                for (int j = 0; j < d; ++j) out[j] = in[j] - mean;
+                const T scale = T(1) / std::sqrt(dot<lanes>(out, out, d) / T(d) + T(1e-5));
+                for (int j = 0; j < d; ++j) out[j] = out[j] * scale * weight.value[j] + bias.value[j];
+                means[row] = mean;
+                scales[row] = scale;
+            }
+        });
     });
     T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
-    tape.on_backward(y, [=, &compute]() mutable {
-        finish.begin_backward();
+    tape.on_backward(y, [=, &compute] {
         const Store store = next_store(x);
         // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
-        const T* sums = sums_of_blocks<T>(compute, x.rows, 4 * d, [=](ptrdiff_t row, T* sum) EACH_TARGET {
-            const T *in = x.value + row * d, mean = means[row], scale = scales[row];
-            T *dy = y.gradient + row * d, *dx = x.gradient + row * d;
-            T *g = sum + 2 * d, *n = sum + 3 * d;  // beside the sums, in the cache
-            finish.backward(dy, y.value + row * d, static_cast<int>(row), d);
+        // A block's sums [4, d]: d_weight, d_bias, and room for a row's g and n beside them in the cache.
+        const T* sums = block_sums<T>(compute, x.rows, 4 * d, [=](auto lanes, ptrdiff_t row, T* sum) INLINE_LAMBDA {
+            const T *in = x.value + row * d, *dy = y.gradient + row * d;
+            T *dx = x.gradient + row * d, *g = sum + 2 * d, *n = sum + 3 * d;
+            const T mean = means[row], scale = scales[row];
             for (int j = 0; j < d; ++j) {
                 n[j] = (in[j] - mean) * scale;
                 g[j] = dy[j] * weight.value[j];
                 sum[j] += dy[j] * n[j];
                 sum[d + j] += dy[j];
             }
-            const T mean_g = dot(g, ones, d) / T(d), mean_gn = dot(g, n, d) / T(d);
+            const T mean_g = dot<lanes>(g, ones, d) / T(d), mean_gn = dot<lanes>(g, n, d) / T(d);
             if (store == Store::overwrite) std::fill_n(dx, d, T(0));
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
@@ -1036,66 +1125,83 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm, Finish fin
 }
 
 // Inverted dropout's factors for the elements of one place in the network: 0 with probability p, 1 / (1 - p) else. They
-// come from the counter (update, place, element), so backward makes them again instead of storing them.
+// come from the counter (update, place, element), so backward may compute them again.
 struct Dropout {
     Random random;
     uint64_t step;
     uint32_t site;
     float probability;
 
-    // factor [n] of the elements [first, first + n).
+    // factor [n] of the elements [first, first + n). Element e has word e % 4 of counter e / 4.
     template <class T>
-    EACH_TARGET void fill(T* factor, size_t first, size_t n) const {
+    void fill(T* factor, size_t first, size_t n) const {
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
-        if (probability == 0) return void(std::fill_n(factor, n, T(1)));
-        for (size_t i = 0; i < n;) {  // element e has word e % 4 of counter e / 4
-            uint32_t words[64];
-            random.words_16(words, step, static_cast<uint32_t>((first + i) / 4), site);
-            const size_t skip = (first + i) % 4, count = std::min(64 - skip, n - i);
-            for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
+        for (size_t i = 0; i < n;) {
+            constexpr size_t counters = 32;
+            uint32_t words[4 * counters];
+            random.many_words<counters>(words, step, static_cast<uint32_t>((first + i) / 4), site);
+            const size_t skip = (first + i) % 4, count = std::min(4 * counters - skip, n - i);
+            vectorised<T>([&](auto) INLINE_LAMBDA {
+                for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
+            });
             i += count;
-        }
-    }
-
-    // x [n] *= the factors of the elements [first, first + n).
-    template <class T>
-    ALWAYS_INLINE void apply(T* x, size_t first, size_t n) const {
-        T factor[256];
-        for (size_t i = 0; probability != 0 && i < n; i += 256) {
-            const size_t count = std::min(n - i, size_t{256});
-            fill(factor, first + i, count);
-            for (size_t j = 0; j < count; ++j) x[i + j] *= factor[j];
         }
     }
 };
 
+// `probability` counts while the tape records; without recording nothing is dropped.
 template <class T>
 Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
     const uint32_t own_site = site + static_cast<uint32_t>(tape.part << 20);
     return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
-// residual + dropout(y), or dropout(y) if the residual is empty.
+// dropout(x) + residual, [n, d]; without the sum if the residual is empty.
 template <class T>
-struct DropoutAdd {
-    Dropout dropout;
-    Tensor<T> residual;  // [n, d]
-    ptrdiff_t d;
-    Store store = Store::accumulate;  // of the residual's gradient
-
-    DropoutAdd(Dropout chosen, Tensor<T> added, int columns) : dropout(chosen), residual(added), d(columns) {}
-    ALWAYS_INLINE void forward(T* y, int row, int begin, int end) const {
-        dropout.apply(y + begin, static_cast<size_t>(row * d + begin), static_cast<size_t>(end - begin));
-        for (int j = begin; residual.value && j < end; ++j) y[j] += residual.value[row * d + j];
-    }
-    void begin_backward() { store = next_store(residual); }
-    ALWAYS_INLINE void backward(T* dy, const T*, int row, int columns) const {
-        if (store == Store::overwrite) std::fill_n(residual.gradient + row * d, columns, T(0));
-        for (int j = 0; residual.value && j < columns; ++j) residual.gradient[row * d + j] += dy[j];
-        dropout.apply(dy, static_cast<size_t>(row * d), static_cast<size_t>(columns));
-    }
-};
+Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor<T> residual = {}) {
+    if (dropout.probability == 0 && !residual.value) return x;
+    const Tensor<T> y = tape.make(x.rows, x.columns);
+    const ptrdiff_t d = x.columns;
+    Compute& compute = tape.compute;
+    // Calls f(first, count, factor) for stretches of at most `stretch` elements; factor [count].
+    const auto for_stretches = [=, &compute](auto&& f) {
+        for_rows(compute, x.rows, 8 * x.columns, [&](int begin, int end, int) {
+            constexpr ptrdiff_t stretch = 1024;
+            T factor[stretch];
+            std::fill_n(factor, stretch, T(1));
+            for (ptrdiff_t first = begin * d; first < end * d; first += stretch) {
+                const ptrdiff_t count = std::min(end * d - first, stretch);
+                if (dropout.probability > 0) dropout.fill(factor, first, count);
+                f(first, count, factor);
+            }
+        });
+    };
+    for_stretches([=](ptrdiff_t first, ptrdiff_t count, const T* factor) {
+        vectorised<T>([=](auto) INLINE_LAMBDA {
+            const T *in = x.value + first, *added = residual.value + first;
+            T* out = y.value + first;
+            for (ptrdiff_t i = 0; i < count; ++i) out[i] = in[i] * factor[i];
+            if (residual.value)
+                for (ptrdiff_t i = 0; i < count; ++i) out[i] += added[i];
+        });
+    });
+    tape.on_backward(y, [=] {
+        const Store to_x = next_store(x), to_residual = next_store(residual);
+        for_stretches([=](ptrdiff_t first, ptrdiff_t count, const T* factor) {
+            vectorised<T>([=](auto) INLINE_LAMBDA {
+                const T* dy = y.gradient + first;
+                T *dx = x.gradient + first, *d_residual = residual.gradient + first;
+                if (to_x == Store::overwrite) std::fill_n(dx, count, T(0));
+                for (ptrdiff_t i = 0; i < count; ++i) dx[i] += dy[i] * factor[i];
+                if (!residual.gradient) return;
+                if (to_residual == Store::overwrite) std::fill_n(d_residual, count, T(0));
+                for (ptrdiff_t i = 0; i < count; ++i) d_residual[i] += dy[i];
+            });
+        });
+    });
+    return y;
+}
 
 // Causal attention, plain, one head: out [n, d] = softmax over keys j <= i of (q_i . k_j / sqrt(d)), times v_j.
 // q, k, v [n, d] of one sequence. The specification; `attention` below is held to it.
@@ -1117,46 +1223,36 @@ void attention_plain(T* out, const T* q, const T* k, const T* v, int n, int d) {
     }
 }
 
-// How a packed batch of token sequences lies in memory, and which of its tokens ask.
-struct Span {
-    int first_token, tokens;   // the sequence's rows of k and v
-    int first_query, queries;  // its rows of q
-};
-
-// to = or += sum_j weight_j row_j, for Width Vectors columns, held in registers (where there are enough).
-template <int Width, int Vectors, class T>
-ALWAYS_INLINE void add_rows_of(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride, int n,
-                               Store store) {
-    typedef T Lanes __attribute__((vector_size(Width * sizeof(T))));
-    typedef Lanes Unaligned __attribute__((aligned(alignof(T)), may_alias));
-    Lanes sum[Vectors] = {};
-    for (int v = 0; store == Store::accumulate && v < Vectors; ++v)
-        sum[v] = *reinterpret_cast<const Unaligned*>(to + Width * v);
-    for (int j = 0; j < n; ++j)
-        for (int v = 0; v < Vectors; ++v)
-            sum[v] += weight[j * weight_stride] * *reinterpret_cast<const Unaligned*>(rows + j * stride + Width * v);
-    for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Unaligned*>(to + Width * v) = sum[v];
-}
-
-// What attention does with rows [n, size]: y_j = scale (x . row_j), and the sum above.
-template <class T>
-EACH_TARGET void dot_rows(T* y, const T* x, const T* rows, int n, int size, T scale) {
+// y_j = scale (x . row_j) for rows [n, size].
+template <int Width, class T>
+ALWAYS_INLINE void dot_rows(T* y, const T* x, const T* rows, int n, int size, T scale) {
     ptrdiff_t j = 0;
-    for (; j + 4 <= n; j += 4)
-        wide_vectors ? dots<4, 16>(y + j, x, rows + j * size, size, size)
-                     : dots<4, 8>(y + j, x, rows + j * size, size, size);
-    for (; j < n; ++j) y[j] = dot(x, rows + j * size, size);
+    for (; j + 4 <= n; j += 4) dots<4, Width>(y + j, x, rows + j * size, size, size);
+    for (; j < n; ++j) y[j] = dot<Width>(x, rows + j * size, size);
     for (j = 0; j < n; ++j) y[j] *= scale;
 }
 
-template <class T>
-EACH_TARGET void add_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride, const T* __restrict rows, int n,
-                          int size, Store store) {
+// to = or += sum_j weight_j row_j, for Width * Vectors columns, held in registers (where there are enough).
+template <int Width, int Vectors, class T>
+ALWAYS_INLINE void add_columns(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride, int n,
+                               Store store) {
+    Vector<T, Width> sum[Vectors] = {};
+    if (store == Store::accumulate)
+        for (int v = 0; v < Vectors; ++v) sum[v] = lanes_at<Width>(to + Width * v);
+    for (int j = 0; j < n; ++j)
+        for (int v = 0; v < Vectors; ++v)
+            sum[v] += weight[j * weight_stride] * lanes_at<Width>(rows + j * stride + Width * v);
+    for (int v = 0; v < Vectors; ++v) lanes_at<Width>(to + Width * v) = sum[v];
+}
+
+// to [size] = or += sum_j weight_j row_j for rows [n, size], weights `weight_stride` apart.
+template <int Width, class T>
+ALWAYS_INLINE void add_weighted_rows(T* __restrict to, const T* weight, ptrdiff_t weight_stride,
+                                     const T* __restrict rows, int n, int size, Store store) {
     int c = 0;
-    for (; wide_vectors && c + 128 <= size; c += 128)
-        add_rows_of<16, 8>(to + c, weight, weight_stride, rows + c, size, n, store);
-    for (; c + 64 <= size; c += 64) add_rows_of<8, 8>(to + c, weight, weight_stride, rows + c, size, n, store);
-    for (; c + 16 <= size; c += 16) add_rows_of<8, 2>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; c + 8 * Width <= size; c += 8 * Width)
+        add_columns<Width, 8>(to + c, weight, weight_stride, rows + c, size, n, store);
+    for (; c + 16 <= size; c += 16) add_columns<8, 2>(to + c, weight, weight_stride, rows + c, size, n, store);
     if (store == Store::overwrite) std::fill(to + c, to + size, T(0));
     for (ptrdiff_t j = 0; j < n; ++j)
         for (int i = c; i < size; ++i) to[i] += weight[j * weight_stride] * rows[j * size + i];
@@ -1169,12 +1265,121 @@ void gather_rows(T* to, const T* rows, ptrdiff_t stride, ptrdiff_t n, ptrdiff_t 
     for (ptrdiff_t j = 0; j < n; ++j) std::copy_n(rows + j * stride, size, to + j * size);
 }
 
+// softmax of x [n], in place, without overflow.
 template <class T>
 void softmax(T* x, int n) {
-    T largest = x[0], total = 0;
-    for (int i = 1; i < n; ++i) largest = std::max(largest, x[i]);
-    for (int i = 0; i < n; ++i) total += x[i] = std::exp(x[i] - largest);
+    const T largest = *std::max_element(x, x + n);
+    T total = 0;
+    for (int i = 0; i < n; ++i) {
+        x[i] = std::exp(x[i] - largest);
+        total += x[i];
+    }
     for (int i = 0; i < n; ++i) x[i] /= total;
+}
+
+// One sequence of a packed batch: where its tokens lie, and which rows are its queries.
+struct Span {
+    int first_token, tokens;   // the sequence's rows of k and v
+    int first_query, queries;  // its rows of q
+};
+
+// What attention's two passes work on, one (sequence, head) at a time.
+template <class T>
+struct AttentionPass {
+    Tensor<T> q, kv, out;
+    const int* position;     // [queries] the token of each query
+    int d, size, heads;      // width of all heads and of one
+    int longest;             // sequence of the batch, in tokens
+    T *weights, *d_weights;  // [queries, heads, longest] after the softmax, before dropout
+    T* factors;              // [queries, heads, longest] of dropout; null: none
+    T scale;                 // 1 / sqrt(size)
+
+    // How many tokens query i sees: its own sequence up to and with itself.
+    int seen_by(ptrdiff_t i, const Span& span) const { return position[i] - span.first_token + 1; }
+    ptrdiff_t head_at(ptrdiff_t i, ptrdiff_t h) const { return (i * heads + h) * longest; }
+
+    // dropout(weights) of a query: the weights themselves, or their product with the factors, in `room` [longest].
+    const T* dropped(ptrdiff_t at, int seen, T* room) const {
+        if (!factors) return weights + at;
+        for (int j = 0; j < seen; ++j) room[j] = factors[at + j] * weights[at + j];
+        return room;
+    }
+
+    // rows [longest, size], room [longest]: scratch memory.
+    template <int Width>
+    ALWAYS_INLINE void forward(const Span& span, ptrdiff_t h, T* rows, T* room) const {
+        const ptrdiff_t end = span.first_query + span.queries, stride = kv.columns;
+        const T* const keys = kv.value + span.first_token * stride + (stride - 2 * d) + h * size;
+        gather_rows(rows, keys, stride, span.tokens, size);
+        for (ptrdiff_t i = span.first_query; i < end; ++i) {
+            T* const w = weights + head_at(i, h);
+            dot_rows<Width>(w, q.value + i * q.columns + h * size, rows, seen_by(i, span), size, scale);
+            softmax(w, seen_by(i, span));
+        }
+        gather_rows(rows, keys + d, stride, span.tokens, size);  // values
+        for (ptrdiff_t i = span.first_query; i < end; ++i) {
+            const int seen = seen_by(i, span);
+            const T* const w = dropped(head_at(i, h), seen, room);
+            add_weighted_rows<Width>(out.value + i * d + h * size, w, 1, rows, seen, size, Store::overwrite);
+        }
+    }
+
+    template <int Width>
+    ALWAYS_INLINE void backward(const Span& span, ptrdiff_t h, T* rows, Store to_q, Store to_kv) const {
+        const ptrdiff_t first = span.first_query, end = first + span.queries, stride = kv.columns, column = h * size;
+        const ptrdiff_t first_key = span.first_token * stride + (stride - 2 * d) + column;
+        gather_rows(rows, kv.value + first_key + d, stride, span.tokens, size);  // values
+        for (ptrdiff_t i = first; i < end; ++i) {
+            const int seen = seen_by(i, span);
+            T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
+            // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
+            dot_rows<Width>(dw, out.gradient + i * d + column, rows, seen, size, T(1));
+            if (factors)
+                for (int j = 0; j < seen; ++j) dw[j] *= factors[head_at(i, h) + j];
+            const T mean = dot<Width>(w, dw, seen);
+            for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
+            if (factors)  // the weights from here on are those after dropout
+                for (int j = 0; j < seen; ++j) w[j] *= factors[head_at(i, h) + j];
+        }
+        // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
+        gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
+        for (ptrdiff_t i = first; i < end; ++i)
+            add_weighted_rows<Width>(q.gradient + i * q.columns + column, d_weights + head_at(i, h), 1, rows,
+                                     seen_by(i, span), size, to_q);
+        // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
+        gather_rows(rows, q.value + first * q.columns + column, q.columns, span.queries, size);
+        add_to_keys<Width>(kv.gradient + first_key, d_weights, span, h, rows, to_kv);
+        gather_rows(rows, out.gradient + first * d + column, d, span.queries, size);
+        add_to_keys<Width>(kv.gradient + first_key + d, weights, span, h, rows, to_kv);
+    }
+
+    // d_key_j = or += sum over the queries i that see j of weight_ij row_i; rows [span.queries, size].
+    template <int Width>
+    ALWAYS_INLINE void add_to_keys(T* d_key, const T* weight, const Span& span, ptrdiff_t h, const T* rows,
+                                   Store store) const {
+        const ptrdiff_t first = span.first_query, end = first + span.queries;
+        ptrdiff_t i = first;
+        for (ptrdiff_t j = 0; j < span.tokens; ++j) {
+            while (i < end && seen_by(i, span) <= j) ++i;
+            add_weighted_rows<Width>(d_key + j * kv.columns, weight + head_at(i, h) + j, ptrdiff_t{heads} * longest,
+                                     rows + (i - first) * size, static_cast<int>(end - i), size, store);
+        }
+    }
+};
+
+// Calls f(lanes, span, head, rows, room) for every head of every span, with scratch memory for `longest` rows of a head
+// and for `longest` numbers. `work`: about how many operations a span.
+template <class T, class F>
+void for_heads(Compute& compute, const AttentionPass<T>& pass, const Span* spans, int span_count, int work,
+               const F& f) {
+    for_rows(compute, span_count, work, [&](int begin, int end, int worker) {
+        const size_t floats = static_cast<size_t>(pass.longest) * static_cast<size_t>(pass.size + 1);
+        T* const rows = reinterpret_cast<T*>(compute.scratch[static_cast<size_t>(worker)].room(floats * sizeof(T)));
+        vectorised<T>([&](auto lanes) INLINE_LAMBDA {
+            for (int s = begin; s < end; ++s)
+                for (int h = 0; h < pass.heads; ++h) f(lanes, spans[s], h, rows, rows + pass.longest * pass.size);
+        });
+    });
 }
 
 // Causal attention with `heads` heads, dropout on the weights, on packed sequences. Positions ascend within a span.
@@ -1183,80 +1388,32 @@ void softmax(T* x, int n) {
 // whole batch and sees its own sequence up to and with itself. Returns [queries, d].
 template <class T>
 Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span* spans, int span_count,
-                    const int* position, int heads, Dropout dropout) {
+                    const int* position, int heads, const Dropout& dropout) {
     const int size = d / heads;
-    const ptrdiff_t q_stride = q.columns, stride = kv.columns, keys = stride - 2 * d;
-    const T scale = T(1) / std::sqrt(T(size));
     const Tensor<T> out = tape.make(q.rows, d);
     int longest = 1;
     for (int s = 0; s < span_count; ++s) longest = std::max(longest, spans[s].tokens);
-    const ptrdiff_t head = longest, query = heads * head;  // from the weights of one to those of the next
-    const size_t all = static_cast<size_t>(q.rows * query);
-    T* weights = tape.template scratch<T>(all);  // [queries, heads, longest]
-    T* d_weights = tape.template scratch<T>(tape.recording ? all : 0);
+    const ptrdiff_t query_size = static_cast<ptrdiff_t>(heads) * longest;
+    const size_t all = static_cast<size_t>(q.rows * query_size);
+    T* const weights = tape.template scratch<T>(all);
+    T* const d_weights = tape.recording ? tape.template scratch<T>(all) : nullptr;
+    T* const factors = dropout.probability > 0 ? tape.template scratch<T>(all) : nullptr;
     Compute& compute = tape.compute;
+    if (factors)  // for whole rows of weights, those of unseen tokens among them, as one stretch of the counter
+        for_rows(compute, q.rows, static_cast<int>(8 * query_size), [=](int begin, int end, int) {
+            dropout.fill(factors + begin * query_size, begin * query_size, (end - begin) * query_size);
+        });
+    const AttentionPass<T> pass = {q,     kv,      out,     position,  d,       size,
+                                   heads, longest, weights, d_weights, factors, T(1) / std::sqrt(T(size))};
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
-    // f(span, head, room for the head's part of `longest` rows, room for `longest` numbers)
-    const auto each_head = [=, &compute](int cost, auto&& f) {
-        for_rows(compute, span_count, cost, [=, &compute](int begin, int end, int worker) {
-            Buffer& scratch = compute.scratch[static_cast<size_t>(worker)];
-            T* const room = reinterpret_cast<T*>(scratch.room(static_cast<size_t>(longest * (size + 1)) * sizeof(T)));
-            for (int s = begin; s < end; ++s)
-                for (int h = 0; h < heads; ++h) f(spans[s], h, room, room + longest * size);
-        });
-    };
-    const auto seen_by = [=](ptrdiff_t i, const Span& span) { return position[i] - span.first_token + 1; };
-    each_head(work, [=](const Span& span, int h, T* rows, T* factor) {
-        const ptrdiff_t end = span.first_query + span.queries;
-        const T* const key = kv.value + span.first_token * stride + keys + h * size;
-        gather_rows(rows, key, stride, span.tokens, size);
-        for (ptrdiff_t i = span.first_query; i < end; ++i) {
-            T* const w = weights + i * query + h * head;
-            dot_rows(w, q.value + i * q_stride + h * size, rows, seen_by(i, span), size, scale);
-            softmax(w, seen_by(i, span));
-        }
-        gather_rows(rows, key + d, stride, span.tokens, size);  // values
-        for (ptrdiff_t i = span.first_query; i < end; ++i) {
-            const int seen = seen_by(i, span);
-            const T* const w = weights + i * query + h * head;
-            dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
-            for (int j = 0; j < seen; ++j) factor[j] *= w[j];
-            add_rows(out.value + i * d + h * size, factor, 1, rows, seen, size, Store::overwrite);
-        }
-    });
-    tape.on_backward(out, [=] {
+    for_heads(compute, pass, spans, span_count, work,
+              [&](auto lanes, const Span& span, int h, T* rows, T* room)
+                  INLINE_LAMBDA { pass.template forward<lanes>(span, h, rows, room); });
+    tape.on_backward(out, [=, &compute] {
         const Store to_q = next_store(q), to_kv = q.value == kv.value ? to_q : next_store(kv);
-        each_head(2 * work, [=](const Span& span, int h, T* rows, T* factor) {
-            const ptrdiff_t first = span.first_query, end = first + span.queries, at = h * size;
-            const ptrdiff_t first_key = span.first_token * stride + keys + at;
-            gather_rows(rows, kv.value + first_key + d, stride, span.tokens, size);  // values
-            for (ptrdiff_t i = first; i < end; ++i) {
-                const int seen = seen_by(i, span);
-                T *w = weights + i * query + h * head, *dw = d_weights + i * query + h * head;
-                // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
-                dot_rows(dw, out.gradient + i * d + at, rows, seen, size, T(1));
-                dropout.fill(factor, static_cast<size_t>(w - weights), static_cast<size_t>(seen));
-                for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
-                const T mean = dot(w, dw, seen);
-                for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale, w[j] *= factor[j];
-            }
-            // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
-            gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
-            for (ptrdiff_t i = first; i < end; ++i)
-                add_rows(q.gradient + i * q_stride + at, d_weights + i * query + h * head, 1, rows, seen_by(i, span),
-                         size, to_q);
-            // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
-            const auto each_key = [=](T* d_key, const T* weight, const T* asking, ptrdiff_t from_one_to_next) {
-                gather_rows(rows, asking + first * from_one_to_next + at, from_one_to_next, span.queries, size);
-                for (ptrdiff_t j = 0, i = first; j < span.tokens; ++j, d_key += stride) {
-                    while (i < end && seen_by(i, span) <= j) ++i;
-                    add_rows(d_key, weight + i * query + h * head + j, query, rows + (i - first) * size,
-                             static_cast<int>(end - i), size, to_kv);
-                }
-            };
-            each_key(kv.gradient + first_key, d_weights, q.value, q_stride);
-            each_key(kv.gradient + first_key + d, weights, out.gradient, d);
-        });
+        for_heads(compute, pass, spans, span_count, 2 * work,
+                  [&](auto lanes, const Span& span, int h, T* rows, T*)
+                      INLINE_LAMBDA { pass.template backward<lanes>(span, h, rows, to_q, to_kv); });
     });
     return out;
 }
@@ -1297,7 +1454,8 @@ inline void orthonormalise(std::vector<double>& x, int rows, int columns) {
     }
 }
 
-// Start values from Stream::initialisation (step: number of the tensor, index: element).
+// The start values of a tensor. fan_in: inputs of its layer, for uniform_fan_in alone. number: of the tensor, in the
+// order of construction. From Stream::initialisation (step: number, index: element).
 template <class T>
 void initialise(Parameter<T>& parameter, Init init, int fan_in, uint32_t seed, uint64_t number) {
     const Random random = {seed, Stream::initialisation};
@@ -1316,7 +1474,8 @@ void initialise(Parameter<T>& parameter, Init init, int fan_in, uint32_t seed, u
 // ---------------------------------------------------------------------------------------------------------------------
 // The decision transformer: GPT-2 blocks over the tokens R_1 s_1 a_1 R_2 s_2 a_2 ... of each window.
 // DT sec. 3, ODT sec. 3. Sequences are packed, never padded, and only what the action prediction needs is computed: the
-// last action of a window is never a token, and in the last layer only the asking state tokens go on after attention.
+// last action of a window is never a token, and in the last layer only the state tokens whose prediction is wanted (the
+// queries) go on after attention.
 
 enum class Head { squashed_gaussian, categorical, deterministic };
 
@@ -1338,12 +1497,14 @@ struct SequenceBatch {
     int steps() const { return static_cast<int>(returns_to_go.size()); }
 };
 
-enum class Ask { every_state, last_state };  // training learns from every step of a window; acting wants the last
+enum class Queries { every_state, last_state };  // training learns from every step of a window; acting wants the last
 
+// The distribution of the next action at each of the queries.
 template <class T>
 struct Policy {
-    Tensor<T> mean;     // [asked, action_dim]; categorical: log-probabilities; deterministic: the action itself
-    Tensor<T> log_std;  // [asked, action_dim] in [-5, 2]; squashed Gaussian only
+    Head head;
+    Tensor<T> output;   // [queries, action_dim] the Gaussian's mean; log-probabilities; or the action itself
+    Tensor<T> log_std;  // [queries, action_dim] in [-5, 2]; squashed Gaussian only
 };
 
 template <class T>
@@ -1364,6 +1525,7 @@ struct Transformer {
     Norm<T> ln_f;
     Affine<T> predict_mean, predict_log_std;
 
+    // A network with fresh parameters. Errors: nn.config for sizes that do not fit together.
     Transformer(const TransformerConfig& c, uint32_t seed, size_t batch_parts = 1)
         : config(c),
           gradient_blocks(batch_parts) {
@@ -1439,110 +1601,112 @@ struct Transformer {
     }
 };
 
-// Where each token of a packed batch lies.
+// Where each token of a packed batch lies, and which tokens are queries.
 struct TokenLayout {
     int tokens = 0;
-    std::vector<Span> all, asked;          // a span per window; queries: all its tokens, or the asking ones
-    std::vector<int> every_token, asking;  // token rows that ask, in all layers but the last, and in the last
-    std::vector<int> step_token;           // [n] row of a step's R token; s and a follow
+    std::vector<Span> all_spans, query_spans;   // one per window; its queries: all its tokens, or the layout's queries
+    std::vector<int> all_tokens, query_tokens;  // token rows
+    std::vector<int> step_token;                // [n] row of a step's R token; s and a follow
 };
 
-inline TokenLayout token_layout(const SequenceBatch& batch, Ask ask) {
+inline TokenLayout token_layout(const SequenceBatch& batch, Queries queries) {
     TokenLayout layout;
     for (const int length : batch.lengths) {
-        const int tokens = 3 * length - 1, first_asking = static_cast<int>(layout.asking.size());
+        const int tokens = 3 * length - 1, first_query = static_cast<int>(layout.query_tokens.size());
         for (int c = 0; c < length; ++c) {
             layout.step_token.push_back(layout.tokens + 3 * c);
-            if (ask == Ask::every_state || c == length - 1) layout.asking.push_back(layout.tokens + 3 * c + 1);
+            const bool is_query = queries == Queries::every_state || c == length - 1;
+            if (is_query) layout.query_tokens.push_back(layout.tokens + 3 * c + 1);
         }
-        layout.all.push_back({layout.tokens, tokens, layout.tokens, tokens});
-        layout.asked.push_back(
-            {layout.tokens, tokens, first_asking, static_cast<int>(layout.asking.size()) - first_asking});
-        for (int i = 0; i < tokens; ++i) layout.every_token.push_back(layout.tokens + i);
+        const int end_query = static_cast<int>(layout.query_tokens.size());
+        layout.all_spans.push_back({layout.tokens, tokens, layout.tokens, tokens});
+        layout.query_spans.push_back({layout.tokens, tokens, first_query, end_query - first_query});
+        for (int i = 0; i < tokens; ++i) layout.all_tokens.push_back(layout.tokens + i);
         layout.tokens += tokens;
     }
     return layout;
 }
 
-// An array that the tape keeps until it is reset, as its steps need it.
-template <class T, class Element>
-const Element* keep(Tape<T>& tape, const std::vector<Element>& x) {
-    return static_cast<const Element*>(
-        std::memcpy(tape.template scratch<Element>(x.size() + 1), x.data(), x.size() * sizeof(Element)));
+// Adds the tokens of the named steps, `offset` rows after their R tokens: inputs [steps, columns] through the layer,
+// plus the row of the position table that belongs to the step's time.
+template <class T>
+void place_tokens(Tape<T>& tape, Tensor<T> tokens, const Transformer<T>& model, const SequenceBatch& batch,
+                  const TokenLayout& layout, const std::vector<int>& steps, int offset,
+                  const std::vector<float>& inputs, int columns, const Affine<T>& layer) {
+    const int count = static_cast<int>(steps.size()), max_timesteps = model.config.max_timesteps;
+    if (count == 0) return;
+    std::vector<int> token_rows, position_rows;
+    for (const int step : steps) {
+        token_rows.push_back(layout.step_token[step] + offset);
+        position_rows.push_back(std::min(batch.timesteps[step], max_timesteps - 1));  // ODT clips at the table's end
+    }
+    const int* rows = tape.keep(token_rows);
+    const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
+    add_rows_by_index(tape, tokens, rows, embedded, nullptr, count);
+    if (max_timesteps == 0) return;
+    Tensor<T> positions = model.embed_ordering;
+    positions.gradient = tape.gradient(positions);
+    add_rows_by_index(tape, tokens, rows, positions, tape.keep(position_rows), count);
 }
 
 // The tokens R, s, a of every step, each through its own linear layer, plus the position's row: [tokens, width].
 template <class T>
 Tensor<T> embed_tokens(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch,
                        const TokenLayout& layout) {
-    const TransformerConfig& config = model.config;
-    const int A = config.action_dim;
-    const Tensor<T> tokens = tape.make(layout.tokens, config.width);
+    const ptrdiff_t action_dim = model.config.action_dim;
+    const Tensor<T> tokens = tape.make(layout.tokens, model.config.width);
     std::fill_n(tokens.value, tokens.size(), T(0));
-    Tensor<T> positions = model.embed_ordering;
-    positions.gradient = tape.gradient(positions);
-    // The tokens of the named steps, `offset` after their R: inputs of each through the layer, plus the position's row.
-    const auto place = [&](const std::vector<size_t>& steps, int offset, const auto& inputs, int columns,
-                           const Affine<T>& layer) {
-        const int count = static_cast<int>(steps.size());
-        if (count == 0) return;
-        std::vector<int> rows, timesteps;
-        for (const size_t step : steps) {
-            rows.push_back(layout.step_token[step] + offset);
-            if (config.max_timesteps > 0)  // ODT clips at the end of its table
-                timesteps.push_back(std::min(batch.timesteps[step], config.max_timesteps - 1));
+    std::vector<int> every_step(batch.returns_to_go.size()), acted;  // `acted`: steps whose action is a token
+    std::iota(every_step.begin(), every_step.end(), 0);
+    std::vector<float> actions;  // [acted, action_dim]
+    int step = 0;
+    for (const int length : batch.lengths) {
+        for (int c = 0; c + 1 < length; ++c) {
+            acted.push_back(step + c);
+            const auto first = batch.actions.begin() + (step + c) * action_dim;
+            actions.insert(actions.end(), first, first + action_dim);
         }
-        const int* kept = keep(tape, rows);
-        const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
-        add_named_rows(tape, tokens, kept, embedded, nullptr, count);
-        if (!timesteps.empty()) add_named_rows(tape, tokens, kept, positions, keep(tape, timesteps), count);
-    };
-    std::vector<size_t> all(batch.returns_to_go.size()), acted;  // steps: all, and those whose action is a token
-    std::iota(all.begin(), all.end(), size_t{0});
-    std::vector<float> actions;
-    for (size_t window = 0, step = 0; window < batch.lengths.size(); ++window, ++step)
-        for (int c = 0; c + 1 < batch.lengths[window]; ++c, ++step) {
-            acted.push_back(step);
-            const auto first = batch.actions.begin() + static_cast<ptrdiff_t>(step) * A;
-            actions.insert(actions.end(), first, first + A);
-        }
-    place(all, 0, batch.returns_to_go, 1, model.embed_return);
-    place(all, 1, batch.states, config.state_dim, model.embed_state);
-    place(acted, 2, actions, A, model.embed_action);
+        step += length;
+    }
+    const TransformerConfig& config = model.config;
+    place_tokens(tape, tokens, model, batch, layout, every_step, 0, batch.returns_to_go, 1, model.embed_return);
+    place_tokens(tape, tokens, model, batch, layout, every_step, 1, batch.states, config.state_dim, model.embed_state);
+    place_tokens(tape, tokens, model, batch, layout, acted, 2, actions, config.action_dim, model.embed_action);
     return tokens;
 }
 
-// Dropout's places: 0 after the embedding's LayerNorm, then three a layer.
+// Dropout's places in the network: 0 after the embedding's LayerNorm, then three a layer.
 inline uint32_t dropout_site(int layer, int place) { return static_cast<uint32_t>(1 + 3 * layer + place); }
 
-// One pre-LN block: x + attention(LN(x)), then + MLP(LN(.)). x [tokens, d] -> [spans' queries, d] for the rows that
-// ask.
+// One pre-LN block: x1 = x + attention(LN(x)), then x1 + MLP(LN(x1)). x [tokens, d] -> [queries, d]: `queries` are the
+// token rows that go on after attention, and each span names its share of them.
 template <class T>
 Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int layer, Tensor<T> x,
-                            const std::vector<Span>& spans, const std::vector<int>& asking) {
+                            const std::vector<Span>& spans, const std::vector<int>& queries) {
     const typename Transformer<T>::Block& block = model.blocks[static_cast<size_t>(layer)];
-    const int d = model.config.width, asked = static_cast<int>(asking.size());
-    const float p = model.config.dropout;
-    const bool all_ask = asked == x.rows;
-    const int* rows = keep(tape, asking);
+    const int d = model.config.width, count = static_cast<int>(queries.size());
+    const auto dropout = [&](int place) { return dropout_at(tape, dropout_site(layer, place), model.config.dropout); };
+    const int* rows = tape.keep(queries);
     const Tensor<T> h = layer_norm(tape, x, block.ln_1);
-    const Tensor<T> q = all_ask ? linear(tape, h, block.c_attn)  // keys and values as well
-                                : linear(tape, select_rows(tape, h, rows, asked), block.c_attn, 0, d);
-    const Tensor<T> kv = all_ask ? q : linear(tape, h, block.c_attn, d, 2 * d);
-    const Tensor<T> a = attention(tape, q, kv, d, keep(tape, spans), static_cast<int>(spans.size()), rows,
-                                  model.config.heads, dropout_at(tape, dropout_site(layer, 0), p));
-    const DropoutAdd<T> add_x(dropout_at(tape, dropout_site(layer, 1), p),
-                              all_ask ? x : select_rows(tape, x, rows, asked), d);
+    Tensor<T> q, kv;
+    if (count == x.rows) {  // every token is a query: one tensor [tokens, 3 d]
+        q = kv = linear(tape, h, block.c_attn);
+    } else {
+        q = linear(tape, select_rows(tape, h, rows, count), block.c_attn, 0, d);
+        kv = linear(tape, h, block.c_attn, d, 2 * d);
+        x = select_rows(tape, x, rows, count);
+    }
+    const Tensor<T> a = attention(tape, q, kv, d, tape.keep(spans), static_cast<int>(spans.size()), rows,
+                                  model.config.heads, dropout(0));
     const std::string name = "transformer.h." + std::to_string(layer);
-    const Tensor<T> x1 = tape.show(name + ".attn", linear(tape, a, block.attn_proj, add_x));
-    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Relu{});
-    const DropoutAdd<T> add_x1(dropout_at(tape, dropout_site(layer, 2), p), x1, d);
-    return tape.show(name, linear(tape, hidden, block.mlp_proj, add_x1));
+    const Tensor<T> x1 = tape.show(name + ".attn", dropout_add(tape, linear(tape, a, block.attn_proj), dropout(1), x));
+    const Tensor<T> hidden = linear(tape, layer_norm(tape, x1, block.ln_2), block.c_fc, Activation::relu);
+    return tape.show(name, dropout_add(tape, linear(tape, hidden, block.mlp_proj), dropout(2), x1));
 }
 
-// f(x) of each element; slope(x, y) is the derivative there.
+// y = f(x) of each element; slope(x, y) is the derivative there.
 template <class T, class F, class Slope>
-Tensor<T> map(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
+Tensor<T> elementwise(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
     const Tensor<T> y = tape.make(x.rows, x.columns);
     for (size_t i = 0; i < x.size(); ++i) y.value[i] = f(x.value[i]);
     tape.on_backward(y, [=] {
@@ -1556,7 +1720,7 @@ Tensor<T> map(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
 template <class T>
 Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
     const auto value = [](T u) { return T(-5) + T(3.5) * (std::tanh(u) + T(1)); };
-    return map(tape, x, value, [](T u, T) {
+    return elementwise(tape, x, value, [](T u, T) {
         const T t = std::tanh(u);
         return T(3.5) * (T(1) - t * t);
     });
@@ -1564,52 +1728,53 @@ Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
 
 template <class T>
 Tensor<T> tanh_of(Tape<T>& tape, Tensor<T> x) {
-    return map(
+    return elementwise(
         tape, x, [](T u) { return std::tanh(u); }, [](T, T y) { return T(1) - y * y; });
 }
 
-// log of the softmax of each row of the logits, [n, moves].
+// log of the softmax of each row of the logits, [n, actions].
 template <class T>
 Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
     const Tensor<T> y = tape.make(logits.rows, logits.columns);
-    const ptrdiff_t moves = logits.columns;
+    const ptrdiff_t actions = logits.columns;
     for (ptrdiff_t row = 0; row < logits.rows; ++row) {
-        const T* x = logits.value + row * moves;
-        const T largest = *std::max_element(x, x + moves);
+        const T* x = logits.value + row * actions;
+        const T largest = *std::max_element(x, x + actions);
         T total = 0;
-        for (ptrdiff_t j = 0; j < moves; ++j) total += std::exp(x[j] - largest);
-        for (ptrdiff_t j = 0; j < moves; ++j) y.value[row * moves + j] = x[j] - largest - std::log(total);
+        for (ptrdiff_t j = 0; j < actions; ++j) total += std::exp(x[j] - largest);
+        for (ptrdiff_t j = 0; j < actions; ++j) y.value[row * actions + j] = x[j] - largest - std::log(total);
     }
     tape.on_backward(y, [=] {
         T* const dx = gradient_of(logits);
         for (ptrdiff_t row = 0; row < logits.rows; ++row) {
-            const T *dy = y.gradient + row * moves, *log_p = y.value + row * moves;
+            const T *dy = y.gradient + row * actions, *log_p = y.value + row * actions;
             T total = 0;
-            for (ptrdiff_t j = 0; j < moves; ++j) total += dy[j];
-            for (ptrdiff_t j = 0; j < moves; ++j) dx[row * moves + j] += dy[j] - std::exp(log_p[j]) * total;
+            for (ptrdiff_t j = 0; j < actions; ++j) total += dy[j];
+            for (ptrdiff_t j = 0; j < actions; ++j) dx[row * actions + j] += dy[j] - std::exp(log_p[j]) * total;
         }
     });
     return y;
 }
 
-// pi_theta(. | s_{-C,t}, g_{-C,t}) for every asking state token of the batch, in order of windows and steps.
+// pi_theta(. | s_{-C,t}, g_{-C,t}) for every query of the batch, in order of windows and steps.
 template <class T>
-Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Ask ask) {
-    const TokenLayout layout = token_layout(batch, ask);
+Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Queries queries) {
+    const TransformerConfig& config = model.config;
+    const TokenLayout layout = token_layout(batch, queries);
     Tensor<T> x = tape.show("embed", embed_tokens(tape, model, batch, layout));
-    const DropoutAdd<T> dropout(dropout_at(tape, 0, model.config.dropout), {}, model.config.width);
-    x = tape.show("embed_ln", layer_norm(tape, x, model.embed_ln, dropout));
-    for (int layer = 0; layer < model.config.layers; ++layer) {
-        const bool last = layer + 1 == model.config.layers;
-        x = transformer_block(tape, model, layer, x, last ? layout.asked : layout.all,
-                              last ? layout.asking : layout.every_token);
+    x = dropout_add(tape, layer_norm(tape, x, model.embed_ln), dropout_at(tape, 0, config.dropout));
+    tape.show("embed_ln", x);
+    for (int layer = 0; layer < config.layers; ++layer) {
+        const bool last = layer + 1 == config.layers;
+        x = transformer_block(tape, model, layer, x, last ? layout.query_spans : layout.all_spans,
+                              last ? layout.query_tokens : layout.all_tokens);
     }
     x = tape.show("transformer.ln_f", layer_norm(tape, x, model.ln_f));
-    Policy<T> policy = {linear(tape, x, model.predict_mean), {}};
-    if (model.config.head == Head::categorical) policy.mean = log_softmax(tape, policy.mean);
-    if (model.config.head == Head::deterministic) policy.mean = tanh_of(tape, policy.mean);
-    tape.show("policy.mean", policy.mean);
-    if (model.config.head == Head::squashed_gaussian)
+    Policy<T> policy = {config.head, linear(tape, x, model.predict_mean), {}};
+    if (config.head == Head::categorical) policy.output = log_softmax(tape, policy.output);
+    if (config.head == Head::deterministic) policy.output = tanh_of(tape, policy.output);
+    tape.show("policy.mean", policy.output);
+    if (config.head == Head::squashed_gaussian)
         policy.log_std = tape.show("policy.log_std", squash_log_std(tape, linear(tape, x, model.predict_log_std)));
     return policy;
 }
@@ -1650,7 +1815,7 @@ Tensor<T> row_sums(Tape<T>& tape, std::array<Tensor<T>, 2> inputs, int rows, int
 // sum of -((u - mean) / std)^2 / 2 - log_std - log(2 pi) / 2 - log(1 - a^2). actions [n, A], strictly inside (-1, 1).
 template <class T>
 Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* actions) {
-    const Tensor<T> mean = policy.mean, log_std = policy.log_std;
+    const Tensor<T> mean = policy.output, log_std = policy.log_std;
     const Tensor<T> a = tape.constant(actions, mean.rows, mean.columns);
     const auto standardised = [=](ptrdiff_t i) {
         return (std::atanh(a.value[i]) - mean.value[i]) / std::exp(log_std.value[i]);
@@ -1670,7 +1835,7 @@ Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* action
 // normal. The gradient flows through the sample, as ODT's does: the Gaussian term is then noise^2 / 2, a constant.
 template <class T>
 Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) {
-    const Tensor<T> mean = policy.mean, log_std = policy.log_std;
+    const Tensor<T> mean = policy.output, log_std = policy.log_std;
     const Tensor<T> n = tape.constant(noise, mean.rows, mean.columns);
     const auto sample = [=](ptrdiff_t i) { return mean.value[i] + std::exp(log_std.value[i]) * n.value[i]; };
     const auto value = [=](ptrdiff_t i) {
@@ -1702,7 +1867,7 @@ Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
         [=](ptrdiff_t i, T dy) { log_p.gradient[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
-// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions.
+// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions. actions [n, A].
 template <class T>
 Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* actions) {
     const Tensor<T> a = tape.constant(actions, prediction.rows, prediction.columns);
@@ -1710,6 +1875,24 @@ Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* action
     return row_sums(
         tape, {prediction}, a.rows, a.columns, [=](ptrdiff_t i) { return error(i) * error(i) / T(a.columns); },
         [=](ptrdiff_t i, T dy) { prediction.gradient[i] += dy * T(2) * error(i) / T(a.columns); });
+}
+
+// log pi(a) of each row, [n, 1]; for DT's deterministic head, minus its loss.
+// actions: [n, A], for a categorical policy [n, 1] whole numbers.
+template <class T>
+Tensor<T> log_prob(Tape<T>& tape, const Policy<T>& policy, const float* actions) {
+    if (policy.head == Head::categorical) return categorical_log_prob(tape, policy.output, actions);
+    if (policy.head == Head::squashed_gaussian) return gaussian_log_prob(tape, policy, actions);
+    const auto minus = [](T x) { return -x; };
+    return elementwise(tape, squared_error(tape, policy.output, actions), minus, [](T, T) { return T(-1); });
+}
+
+// H(pi) of each row, [n, 1]: exact where the policy is categorical, else by one sample with the given standard normal
+// noise [n, A]. Not for the deterministic head.
+template <class T>
+Tensor<T> entropy(Tape<T>& tape, const Policy<T>& policy, const float* noise) {
+    if (policy.head == Head::categorical) return categorical_entropy(tape, policy.output);
+    return gaussian_entropy(tape, policy, noise);
 }
 
 // sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
@@ -1755,8 +1938,9 @@ inline double warmup_factor(uint64_t update, uint64_t warmup_updates) {
     return update + 1 >= warmup_updates ? 1.0 : static_cast<double>(update + 1) / static_cast<double>(warmup_updates);
 }
 
-// Sums of squares are taken in double: eight lanes within a block of 4096, the blocks added in order.
-constexpr size_t square_block = 4096;
+// Updates work on blocks of this many elements. Sums of squares are taken in double: eight lanes within a block, the
+// blocks added in order.
+constexpr size_t update_block = 4096;
 
 template <class T>
 double block_of_squares(const T* x, size_t n) {
@@ -1772,9 +1956,9 @@ double block_of_squares(const T* x, size_t n) {
 // f(block, first, count) for each block of [0, n), on all threads.
 template <class F>
 void for_blocks(Compute& compute, size_t n, int work, F&& f) {
-    for_rows(compute, static_cast<int>(divide_up(n, square_block)), work, [&](int begin, int end, int) {
+    for_rows(compute, static_cast<int>(divide_up(n, update_block)), work, [&](int begin, int end, int) {
         for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
-            f(b, b * square_block, std::min(n - b * square_block, square_block));
+            f(b, b * update_block, std::min(n - b * update_block, update_block));
     });
 }
 
@@ -1790,32 +1974,37 @@ inline double power(double x, uint64_t n) {
 //   m = beta1 m + (1 - beta1) g;  v = beta2 v + (1 - beta2) g^2
 //   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon), in LAMB + weight decay times value
 // Written over the gradient, which is not needed any more.
-EACH_TARGET inline void adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v,
-                                  const float* __restrict value, size_t n, const OptimizerConfig& config, double scale,
-                                  double bias1, double bias2) {
+inline void adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v,
+                      const float* __restrict value, size_t n, const OptimizerConfig& config, double scale,
+                      double bias1, double bias2) {
     const float beta1 = static_cast<float>(config.beta1), beta2 = static_cast<float>(config.beta2);
     const float one_minus_1 = static_cast<float>(1 - config.beta1), one_minus_2 = static_cast<float>(1 - config.beta2);
     const float clip = static_cast<float>(scale), root_bias2 = static_cast<float>(std::sqrt(bias2));
     const float inverse_bias1 = static_cast<float>(1 / bias1), epsilon = static_cast<float>(config.epsilon);
     const float decay = config.rule == OptimizerConfig::Rule::lamb ? static_cast<float>(config.weight_decay) : 0.0f;
-    for (size_t i = 0; i < n; ++i) {
-        const float g = gradient[i] * clip;
-        m[i] = beta1 * m[i] + one_minus_1 * g;
-        v[i] = beta2 * v[i] + one_minus_2 * g * g;
-        gradient[i] = m[i] * inverse_bias1 / (std::sqrt(v[i]) / root_bias2 + epsilon) + decay * value[i];
-    }
+    vectorised<float>([=](auto) INLINE_LAMBDA {
+        for (size_t i = 0; i < n; ++i) {
+            const float g = gradient[i] * clip;
+            m[i] = beta1 * m[i] + one_minus_1 * g;
+            v[i] = beta2 * v[i] + one_minus_2 * g * g;
+            gradient[i] = m[i] * inverse_bias1 / (std::sqrt(v[i]) / root_bias2 + epsilon) + decay * value[i];
+        }
+    });
 }
 
 // value = shrink value - rate u, u in `gradient`, which is emptied. Returns whether all values are finite.
-EACH_TARGET inline bool apply_step(float* __restrict value, float* __restrict gradient, size_t n, float shrink,
-                                   float rate) {
+inline bool apply_step(float* __restrict value, float* __restrict gradient, size_t n, float shrink, float rate) {
     int bad = 0;
-    for (size_t i = 0; i < n; ++i) {
-        value[i] = shrink * value[i] - rate * gradient[i];
-        gradient[i] = 0;
-        bad |= !(value[i] - value[i] == 0);  // infinity and NaN are not themselves less themselves
-    }
-    return !bad;
+    vectorised<float>([=, &bad](auto) INLINE_LAMBDA {
+        int any = 0;
+        for (size_t i = 0; i < n; ++i) {
+            value[i] = shrink * value[i] - rate * gradient[i];
+            gradient[i] = 0;
+            any |= !(value[i] - value[i] == 0);  // infinity and NaN are not themselves less themselves
+        }
+        bad = any;
+    });
+    return bad == 0;
 }
 
 // Adds the gradients of all blocks, in order, to the first, empties the others, and returns the norm of all. Errors:
@@ -1826,8 +2015,8 @@ double join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
     std::vector<double> sums;
     for (Parameter<T>& parameter : parameters) {
         const size_t n = parameter.value.size();
-        sums.assign(divide_up(n, square_block), 0);
-        for_blocks(compute, n, square_block, [&](size_t block, size_t first, size_t count) {
+        sums.assign(divide_up(n, update_block), 0);
+        for_blocks(compute, n, update_block, [&](size_t block, size_t first, size_t count) {
             T* const gradient = parameter.gradient.data() + first;
             for (size_t other = n; other < parameter.gradient.size(); other += n) {
                 for (size_t i = 0; i < count; ++i) gradient[i] += gradient[other + i];
@@ -1865,7 +2054,7 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         const size_t n = parameter.value.size();
         m.resize(n);
         v.resize(n);
-        const size_t blocks = divide_up(n, square_block);
+        const size_t blocks = divide_up(n, update_block);
         std::vector<double> value_squares(blocks), step_squares(blocks);
         std::vector<unsigned char> bad(blocks);
         double trust = 1;
@@ -1873,7 +2062,7 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
             bad[block] = !apply_step(parameter.value.data() + first, parameter.gradient.data() + first, count, shrink,
                                      static_cast<float>(learning_rate * trust));
         };
-        for_blocks(compute, n, 16 * square_block, [&](size_t block, size_t first, size_t count) {
+        for_blocks(compute, n, 16 * update_block, [&](size_t block, size_t first, size_t count) {
             float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
             adam_step(step, m.data() + first, v.data() + first, value, count, config, scale, bias1, bias2);
             if (!adapt) return apply(block, first, count);
@@ -1884,7 +2073,7 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
             const double value_norm = std::sqrt(std::accumulate(value_squares.begin(), value_squares.end(), 0.0));
             const double step_norm = std::sqrt(std::accumulate(step_squares.begin(), step_squares.end(), 0.0));
             if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
-            for_blocks(compute, n, 4 * square_block, apply);
+            for_blocks(compute, n, 4 * update_block, apply);
         }
         if (std::count(bad.begin(), bad.end(), 1) > 0)
             fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());

@@ -775,26 +775,6 @@ void count_consultation(Run& run, const Batch& batch) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The objective.
 
-// log pi_theta(a_c | s^c, g^c), [n, 1]; DT's deterministic head: minus the squared error.
-template <class T>
-Tensor<T> log_prob(Tape<T>& tape, Head head, const Policy<T>& policy, const float* actions) {
-    if (head == Head::categorical) return categorical_log_prob(tape, policy.mean, actions);
-    if (head == Head::squashed_gaussian) return gaussian_log_prob(tape, policy, actions);
-    const Tensor<T> error = squared_error(tape, policy.mean, actions), negative = tape.make(error.rows, 1);
-    for (int i = 0; i < error.rows; ++i) negative.value[i] = -error.value[i];
-    tape.on_backward(negative, [=] {
-        for (int i = 0; i < error.rows; ++i) gradient_of(error)[i] -= negative.gradient[i];
-    });
-    return negative;
-}
-
-// H(pi_theta(. | s^c, g^c)), [n, 1]: exact where the policy is categorical, else by one sample with the given noise.
-template <class T>
-Tensor<T> policy_entropy(Tape<T>& tape, Head head, const Policy<T>& policy, const float* noise) {
-    if (head == Head::categorical) return categorical_entropy(tape, policy.mean);
-    return gaussian_entropy(tape, policy, noise);
-}
-
 template <class T>
 struct Objective {
     Tensor<T> L;           // L(theta), or J(theta) where all w = 1
@@ -804,8 +784,8 @@ struct Objective {
 
 // Equations (2), (3), (8) to (10) for one batch. `entropy_noise` [n, action_dim]: for the Gaussian head only.
 template <class T>
-Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const Batch& batch,
-                       const float* entropy_noise, std::type_identity_t<T> lambda, bool constrain_entropy) {
+Objective<T> objective(Tape<T>& tape, const Policy<T>& policy, const Batch& batch, const float* entropy_noise,
+                       std::type_identity_t<T> lambda, bool constrain_entropy) {
     const std::vector<T> mean(batch.mean.begin(), batch.mean.end()), w(batch.weights.begin(), batch.weights.end());
     std::vector<T> observed(mean.size()), advised(mean.size());
     for (size_t i = 0; i < mean.size(); ++i) {
@@ -816,16 +796,15 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
     // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
     // WODTEM eq. (2): J is L with w = 1. Both terms read one distribution; the action tokens stay the buffer's.
     // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; not over all steps.
-    result.L =
-        combine(tape, T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.actions.data()), observed.data()),
-                T(1), weighted_sum(tape, log_prob(tape, head, policy, batch.remembered.data()), advised.data()));
+    result.L = combine(tape, T(1), weighted_sum(tape, log_prob(tape, policy, batch.actions.data()), observed.data()),
+                       T(1), weighted_sum(tape, log_prob(tape, policy, batch.remembered.data()), advised.data()));
     if (!constrain_entropy) {
         result.lagrangian = result.L;
         return result;
     }
     // WODTEM eq. (3); WODTEM eq. (10): H-bar = E[ 1/|C^t| sum_c H(pi(. | s^c, g^c)) ]
     // departs from ODT's code: over real steps only, as written; there padding enters this mean.
-    result.H = weighted_sum(tape, policy_entropy(tape, head, policy, entropy_noise), mean.data());
+    result.H = weighted_sum(tape, entropy(tape, policy, entropy_noise), mean.data());
     // WODTEM eq. (1); WODTEM eq. (8): L + lambda (eta - H-bar), which theta descends: lambda eta does not depend on it.
     result.lagrangian = combine(tape, T(1), result.L, -lambda, result.H);
     return result;
@@ -835,9 +814,8 @@ Objective<T> objective(Tape<T>& tape, Head head, const Policy<T>& policy, const 
 template <class T>
 Objective<T> learn(Tape<T>& tape, const Transformer<T>& model, const Batch& batch, const float* entropy_noise,
                    std::type_identity_t<T> lambda, bool constrain_entropy) {
-    const Policy<T> policy = forward(tape, model, batch.sequences, Ask::every_state);
-    const Objective<T> result =
-        objective(tape, model.config.head, policy, batch, entropy_noise, lambda, constrain_entropy);
+    const Policy<T> policy = forward(tape, model, batch.sequences, Queries::every_state);
+    const Objective<T> result = objective(tape, policy, batch, entropy_noise, lambda, constrain_entropy);
     tape.backward(result.lagrangian);
     return result;
 }
@@ -910,7 +888,7 @@ void update(Run& run) {
     if (run.parts.side_by_side) {
         run.compute.threads.run(static_cast<int>(parts.size()), learn);
     } else {
-        const KeepPacked weights(run.compute);
+        const FrozenWeights frozen(run.compute);
         for (size_t part = 0; part < parts.size(); ++part) learn(static_cast<int>(part), 0);
     }
     double loss = 0, entropy = 0;
@@ -954,8 +932,8 @@ int sampled_move(const float* log_p, int moves, double uniform) {
 // The action of one row of the policy, as it is stored and stepped. Random: one stream, one number per dimension.
 std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act,
                                  const Random& random, uint64_t episode, uint32_t t) {
-    const int columns = policy.mean.columns;
-    const float* mean = policy.mean.value + static_cast<ptrdiff_t>(row) * columns;
+    const int columns = policy.output.columns;
+    const float* mean = policy.output.value + static_cast<ptrdiff_t>(row) * columns;
     std::vector<float> action;
     if (agent.spec.moves > 0) {
         if (act == Act::most_likely) return {static_cast<float>(most_likely_move(mean, columns))};
@@ -1033,7 +1011,7 @@ std::vector<Episode> rollout(Run& run, std::vector<Environment>& environments, A
     const Agent& agent = run.agent;
     const EnvironmentSpec& spec = agent.spec;
     const double reward_scale = agent.settings.reward_scale;
-    const KeepPacked weights(run.compute);
+    const FrozenWeights frozen(run.compute);
     std::vector<Episode> episodes(static_cast<size_t>(count));
     for (size_t i = 0; i < episodes.size(); ++i) {
         episodes[i].state.resize(static_cast<size_t>(spec.state_dim));
@@ -1044,7 +1022,7 @@ std::vector<Episode> rollout(Run& run, std::vector<Environment>& environments, A
         const SequenceBatch batch = acting_batch(agent, episodes);
         if (batch.lengths.empty()) break;
         run.acting.reset();
-        const Policy<float> policy = forward(run.acting, agent.model, batch, Ask::last_state);
+        const Policy<float> policy = forward(run.acting, agent.model, batch, Queries::last_state);
         std::vector<size_t> going;
         std::vector<std::vector<float>> actions;
         for (size_t i = 0; i < episodes.size(); ++i) {
@@ -1478,10 +1456,10 @@ std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
         batch.actions.resize(batch.actions.size() + grid_moves);
     }
     run.acting.reset();
-    const Policy<float> policy = forward(run.acting, run.agent.model, batch, Ask::last_state);
+    const Policy<float> policy = forward(run.acting, run.agent.model, batch, Queries::last_state);
     std::vector<std::vector<float>> probabilities(grid_cells);
-    for (size_t i = 0; i < policy.mean.size(); ++i)
-        probabilities[i / grid_moves].push_back(std::exp(policy.mean.value[i]));
+    for (size_t i = 0; i < policy.output.size(); ++i)
+        probabilities[i / grid_moves].push_back(std::exp(policy.output.value[i]));
     return probabilities;
 }
 

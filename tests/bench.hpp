@@ -89,11 +89,11 @@ struct Measurements {
 
 constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
 
-template <class Vector, bool Fused>
+template <class V, bool Fused>
 ALWAYS_INLINE float burn_vectors(int64_t rounds) {
-    Vector sum[burn_chains], a = 0.999f - Vector{}, b = 0.001f - Vector{};
+    V sum[burn_chains], a = 0.999f - V{}, b = 0.001f - V{};
 #pragma GCC unroll 16
-    for (int i = 0; i < burn_chains; ++i) sum[i] = Vector{};
+    for (int i = 0; i < burn_chains; ++i) sum[i] = V{};
     for (int64_t round = 0; round < rounds; ++round) {
 #pragma GCC unroll 16
         for (int i = 0; i < burn_chains; ++i) {
@@ -106,20 +106,24 @@ ALWAYS_INLINE float burn_vectors(int64_t rounds) {
         asm volatile("" : "+v"(a));  // a might have changed: no product may leave the loop
 #endif
     }
-    Vector total = sum[0];
+    V total = sum[0];
 #pragma GCC unroll 16
     for (int i = 1; i < burn_chains; ++i) total += sum[i];
     return total[0];
 }
 
 #ifdef X86_KERNELS
-__attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) { return burn_vectors<Float16, true>(rounds); }
-__attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) { return burn_vectors<Float8, true>(rounds); }
+__attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) {
+    return burn_vectors<Vector<float, 16>, true>(rounds);
+}
+__attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) {
+    return burn_vectors<Vector<float, 8>, true>(rounds);
+}
 #endif
 
 // Operations a second of one core in the kernel's own instructions.
 double burn_rate(const Kernel& kernel) {
-    float (*burn)(int64_t) = burn_vectors<Float4, false>;
+    float (*burn)(int64_t) = burn_vectors<Vector<float, 4>, false>;
     const double operations = 2.0 * burn_chains * kernel.tile_columns / 2;
 #ifdef X86_KERNELS
     if (&kernel == &kernel_avx512) burn = burn_avx512;
@@ -293,10 +297,10 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
         episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
     }
     const SequenceBatch batch = acting_batch(run.agent, playing);
-    const KeepPacked weights(run.compute);
+    const FrozenWeights frozen(run.compute);
     const Spread time = timed(9, [&] {
         run.acting.reset();
-        forward(run.acting, run.agent.model, batch, Ask::last_state);
+        forward(run.acting, run.agent.model, batch, Queries::last_state);
     });
     const Kernel& kernel = run.compute.kernel;
     const double d = static_cast<double>(run.agent.settings.width), tokens = 3.0 * batch.lengths[0] - 1,

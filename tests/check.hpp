@@ -526,7 +526,7 @@ void check_mlp(Case& c) {
     const Tensor<T> b1 = graph.variable("c_fc.bias", shape_of(w1.columns));
     const Tensor<T> w2 = graph.variable("c_proj.weight", {static_cast<uint64_t>(w1.columns), any});
     const Tensor<T> b2 = graph.variable("c_proj.bias", shape_of(w2.columns));
-    const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Relu{});
+    const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Activation::relu);
     const Tensor<T> y = linear(graph.tape, hidden, Affine<T>{w2, b2, Layout::in_out});
     graph.finish({{"y", shape_of(x.rows, w2.columns), y}});
 }
@@ -709,7 +709,7 @@ void check_tokens(Case& c) {
     Tape<T> tape(c.compute);
     LayerOutputs<T> layers;
     layers.watch(tape);
-    forward(tape, *model, windows.sequences, Ask::every_state);
+    forward(tape, *model, windows.sequences, Queries::every_state);
     bool held = false;
     for (const auto& output : layers.outputs) {
         held |= c.has("out/layer/" + output.name);
@@ -729,7 +729,7 @@ void check_policy_gaussian(Case& c) {
     const Tensor<T> mean = graph.variable("mean", {any, any});
     const Shape shape = shape_of(mean.rows, mean.columns), rows = shape_of(mean.rows);
     const bool raw = c.has("in/log_std_raw");
-    Policy<T> policy = {mean, graph.variable(raw ? "log_std_raw" : "log_std", shape)};
+    Policy<T> policy = {Head::squashed_gaussian, mean, graph.variable(raw ? "log_std_raw" : "log_std", shape)};
     std::vector<typename Graph<T>::Output> outputs;
     if (raw) {
         policy.log_std = squash_log_std(graph.tape, policy.log_std);
@@ -748,10 +748,10 @@ void check_policy_gaussian(Case& c) {
         std::vector<float> sampled, likely, clamped;
         std::vector<double> slack;  // of a sum that cancels: a dozen roundings of exp(log_std) noise, through tanh
         for (size_t i = 0; i < mean.size(); ++i) {
-            likely.push_back(squashed_action(policy.mean.value[i]));
+            likely.push_back(squashed_action(policy.output.value[i]));
             if (noise.empty()) continue;
             const float spread = std::exp(policy.log_std.value[i]) * noise[i];
-            const double a = sampled.emplace_back(squashed_action(policy.mean.value[i] + spread));
+            const double a = sampled.emplace_back(squashed_action(policy.output.value[i] + spread));
             slack.push_back(12 * 0x1p-24 * std::fabs(spread) * (1 - a * a));
         }
         constexpr double most = 4 * 0x1p-24;  // the clamp takes off 1e-6
@@ -802,11 +802,10 @@ void check_policy_deterministic(Case& c) {
     Graph<T> graph(c);
     const Tensor<T> raw = graph.variable("raw", {any, any});
     const Shape shape = shape_of(raw.rows, raw.columns);
-    const Policy<T> policy = {tanh_of(graph.tape, raw), {}};
+    const Policy<T> policy = {Head::deterministic, tanh_of(graph.tape, raw), {}};
     const auto actions = c.in<float>("actions", shape);
-    graph.finish(
-        {{"action", shape, policy.mean},
-         {"log_prob", shape_of(raw.rows), log_prob(graph.tape, Head::deterministic, policy, actions.values.data())}});
+    graph.finish({{"action", shape, policy.output},
+                  {"log_prob", shape_of(raw.rows), log_prob(graph.tape, policy, actions.values.data())}});
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1124,15 +1123,15 @@ void check_objective(Case& c) {
     const char* name = config.head == Head::categorical     ? "logits"
                        : config.head == Head::deterministic ? "raw"
                                                             : "mean";
-    Policy<T> policy = {graph.variable(name, {any, any}), {}};
-    config.action_dim = policy.mean.columns;
+    Policy<T> policy = {config.head, graph.variable(name, {any, any}), {}};
+    config.action_dim = policy.output.columns;
     const bool gaussian = config.head == Head::squashed_gaussian;
-    if (gaussian) policy.log_std = graph.variable("log_std", shape_of(policy.mean.rows, config.action_dim));
-    if (config.head == Head::categorical) policy.mean = log_softmax(graph.tape, policy.mean);
-    if (config.head == Head::deterministic) policy.mean = tanh_of(graph.tape, policy.mean);
+    if (gaussian) policy.log_std = graph.variable("log_std", shape_of(policy.output.rows, config.action_dim));
+    if (config.head == Head::categorical) policy.output = log_softmax(graph.tape, policy.output);
+    if (config.head == Head::deterministic) policy.output = tanh_of(graph.tape, policy.output);
     Windows windows;
-    windows.steps = shape_of(policy.mean.rows);
-    windows.sequences.lengths = lengths_of(c, policy.mean.rows);
+    windows.steps = shape_of(policy.output.rows);
+    windows.sequences.lengths = lengths_of(c, policy.output.rows);
     windows.actions = actions_in(c, "actions", windows, config);
     const Batch batch = read_batch(c, windows, config);
     const bool constrain = config.head != Head::deterministic;
@@ -1140,7 +1139,7 @@ void check_objective(Case& c) {
     if (gaussian) noise = c.in<float>("noise", windows.rows_of(static_cast<uint64_t>(config.action_dim))).values;
     const double log_lambda = constrain ? c.number("log_temperature", std::log(0.1), -50, 50) : 0;
     const T lambda = static_cast<T>(std::exp(static_cast<T>(log_lambda)));
-    const Objective<T> result = objective(graph.tape, config.head, policy, batch, noise.data(), lambda, constrain);
+    const Objective<T> result = objective(graph.tape, policy, batch, noise.data(), lambda, constrain);
     const auto scalar = [&](const char* output, T value, bool optional) {
         c.expect(output, {}, std::vector<T>{value}, optional);
     };

@@ -104,17 +104,15 @@ TEST(philox_gives_the_published_known_answers) {  // Random123, kat_vectors
            Words4{0xd16cfe09, 0x94fdcceb, 0x5001e420, 0x24126ea1}));
 }
 
-TEST(sixteen_counters_at_once_have_the_words_of_each) {
+TEST(many_counters_at_once_have_the_words_of_each) {
     for (uint32_t trial = 0; trial < 200; ++trial) {  // also where the counter wraps
         const Words4 counter = philox({trial, 1, 2, 3}, test_seed(), 0);
-        const uint32_t first = trial % 2 == 0 ? counter[0] : 0xffffffff - trial % 16;
-        for (const auto sixteen : {philox_16, philox_16_plain}) {
-            uint32_t words[64];
-            sixteen(words, {first, counter[1], counter[2], counter[3]}, trial, test_seed());
-            for (uint32_t i = 0; i < 16; ++i) {
-                const Words4 one = philox({first + i, counter[1], counter[2], counter[3]}, trial, test_seed());
-                for (uint32_t j = 0; j < 4; ++j) CHECK_EQUAL(words[4 * i + j], one[j]);
-            }
+        const uint32_t first = trial % 2 == 0 ? counter[0] : 0xffffffff - trial % 32;
+        uint32_t words[128];
+        philox_words<32>(words, {first, counter[1], counter[2], counter[3]}, trial, test_seed());
+        for (uint32_t i = 0; i < 32; ++i) {
+            const Words4 one = philox({first + i, counter[1], counter[2], counter[3]}, trial, test_seed());
+            for (uint32_t j = 0; j < 4; ++j) CHECK_EQUAL(words[4 * i + j], one[j]);
         }
     }
 }
@@ -315,7 +313,7 @@ TEST(matmul_gives_the_same_bits_for_any_number_of_threads) {
         }
 }
 
-TEST(matmul_packs_a_lasting_matrix_once_a_period_and_again_in_the_next) {
+TEST(matmul_packs_a_frozen_weight_once_and_again_when_frozen_anew) {
     Draws draws = {4};
     constexpr int M = 70, N = 67, K = 700;
     const std::vector<float> a = draws.normals<float>(M * K);
@@ -323,18 +321,18 @@ TEST(matmul_packs_a_lasting_matrix_once_a_period_and_again_in_the_next) {
         for (const bool transposed : {false, true}) {
             Compute compute(*kernel, 2);
             std::vector<float> b = draws.normals<float>(K * N);
-            const auto times = [&](bool lasting) {
+            const auto times = [&](bool weight) {
                 std::vector<float> c(M * N);
-                const View<const float> view = {b.data(), transposed ? K : N, transposed, lasting};
+                const View<const float> view = {b.data(), transposed ? K : N, transposed, weight};
                 matmul(compute, View<float>{c.data(), N}, {a.data(), K}, view, M, N, K, Store::overwrite);
                 return c;
             };
             for (int period = 0; period < 2; ++period) {
                 const std::vector<float> expected = times(false);
                 {
-                    const KeepPacked now(compute);
+                    const FrozenWeights frozen(compute);
                     CHECK(same_bits(times(true), expected));
-                    b[5] += 1;  // which no one may do: this shows that it is not read again
+                    b[5] += 1;  // which no one may do: this shows that the weight is not read again
                     CHECK(same_bits(times(true), expected));
                     CHECK(!same_bits(times(false), expected));
                 }
@@ -371,24 +369,30 @@ TEST(products_that_are_not_finite_stay_so_in_every_kernel) {
         }
 }
 
-TEST(every_part_of_a_product_is_finished_once_after_its_last_addition) {
-    constexpr int M = 101, N = 70, K = 600;
+TEST(bias_and_relu_are_applied_once_after_the_last_addition) {
+    constexpr int M = 101, N = 70;
     Draws draws = {5};
-    const std::vector<float> a = draws.normals<float>(M * K), b = draws.normals<float>(K * N);
+    const std::vector<float> a = draws.normals<float>(M * 600), b = draws.normals<float>(600 * N),
+                             bias = draws.normals<float>(N);
     for (const Kernel* kernel : kernels_of_this_machine())
-        for (const int threads : {1, 3}) {
-            Compute compute(*kernel, threads);
-            std::vector<float> plain(M * N, 2.0f), c(M * N, 2.0f);
-            matmul(compute, View<float>{plain.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate);
-            const auto each = [&](const Block& block, auto&& f) {
-                for (int i = block.first_row; i < block.end_row; ++i)
-                    for (int j = block.first_column; j < block.end_column; ++j) f(c[static_cast<size_t>(i * N + j)]);
-            };
-            matmul(compute, View<float>{c.data(), N}, {a.data(), K}, {b.data(), N}, M, N, K, Store::accumulate,
-                   [&](const Block& block) { each(block, [](float& x) { x = -0.5f * x + 1; }); });
-            for (float& x : plain) x = -0.5f * x + 1;
-            CHECK(same_bits(c, plain));
-        }
+        for (const int threads : {1, 3})
+            for (const int K : {0, 600})
+                for (const bool relu : {false, true}) {
+                    Compute compute(*kernel, threads);
+                    std::vector<float> plain(M * N, 2.0f), c(M * N, 2.0f);
+                    const View<const float> view_a = {a.data(), K}, view_b = {b.data(), N};
+                    matmul(compute, View<float>{plain.data(), N}, view_a, view_b, M, N, K, Store::accumulate);
+                    matmul(compute, View<float>{c.data(), N}, view_a, view_b, M, N, K, Store::accumulate,
+                           {bias.data(), relu});
+                    for (size_t i = 0; i < plain.size(); ++i) {
+                        plain[i] += bias[i % N];
+                        if (relu && plain[i] < 0) plain[i] = 0;
+                    }
+                    CHECK(same_bits(c, plain));
+                }
+    float c = NAN;
+    apply_epilogue<float>({&c, 1}, {nullptr, true}, {0, 1, 0, 1});
+    CHECK(std::isnan(c));
 }
 
 TEST(kernels_are_found_by_name) {
@@ -540,8 +544,8 @@ TEST(gradients_of_small_operations_equal_central_differences) {
     const Affine<double> affine = {w.tensor(), b.tensor(), Layout::out_in};
     const auto dropped = [&](float p, bool residual) {
         return [&, p, residual](Tape<double>& tape) {
-            const DropoutAdd<double> finish(dropout_of(tape, p), residual ? y.tensor() : Tensor<double>{}, 3);
-            return linear(tape, x.tensor(), affine, finish);
+            return dropout_add(tape, linear(tape, x.tensor(), affine), dropout_of(tape, p),
+                               residual ? y.tensor() : Tensor<double>{});
         };
     };
     Gradients gradients = {"the small operations"};
@@ -549,21 +553,22 @@ TEST(gradients_of_small_operations_equal_central_differences) {
     gradients.check("linear, dropout, residual", dropped(0, true), {&x, &y, &w, &b});
     gradients.check("linear, dropout, residual, p 0.4", dropped(0.4f, true), {&x, &y, &w, &b});
     gradients.check("linear, dropout, p 0.4", dropped(0.4f, false), {&x, &w, &b});
-    gradients.check("linear, relu", [&](auto& t) { return linear(t, x.tensor(), affine, Relu{}); }, {&x, &w, &b});
-    gradients.check("layer_norm, dropout, p 0.4",
-                    [&](auto& t) {
-                        const DropoutAdd<double> finish(dropout_of(t, 0.4f), {}, 3);
-                        return layer_norm(t, x.tensor(), {norm_w.tensor(), norm_b.tensor()}, finish);
-                    },
-                    {&x, &norm_w, &norm_b});
+    gradients.check("linear, relu", [&](auto& t) { return linear(t, x.tensor(), affine, Activation::relu); },
+                    {&x, &w, &b});
+    gradients.check(
+        "layer_norm, dropout, p 0.4",
+        [&](auto& t) {
+            return dropout_add(t, layer_norm(t, x.tensor(), {norm_w.tensor(), norm_b.tensor()}), dropout_of(t, 0.4f));
+        },
+        {&x, &norm_w, &norm_b});
     gradients.check("tanh_of", [&](auto& t) { return tanh_of(t, x.tensor()); }, {&x});
     gradients.check("squash_log_std", [&](auto& t) { return squash_log_std(t, x.tensor()); }, {&x});
-    gradients.check("add_named_rows",
+    gradients.check("add_rows_by_index",
                     [&](auto& t) {
                         const Tensor<double> to = t.make(7, 3);
                         std::fill_n(to.value, to.size(), 0.0);
-                        add_named_rows(t, to, places.data(), x.tensor(), nullptr, x.tensor().rows);
-                        add_named_rows(t, to, places.data(), table.tensor(), index.data(), x.tensor().rows);
+                        add_rows_by_index(t, to, places.data(), x.tensor(), nullptr, x.tensor().rows);
+                        add_rows_by_index(t, to, places.data(), table.tensor(), index.data(), x.tensor().rows);
                         return to;
                     },
                     {&x, &table});
@@ -573,8 +578,7 @@ TEST(gradients_of_small_operations_equal_central_differences) {
                     {&one, &two});
     gradients.check("a tensor used twice",
                     [&](auto& t) {
-                        const DropoutAdd<double> finish(dropout_of(t, 0), tanh_of(t, x.tensor()), 3);
-                        return linear(t, x.tensor(), affine, finish);
+                        return dropout_add(t, linear(t, x.tensor(), affine), dropout_of(t, 0), tanh_of(t, x.tensor()));
                     },
                     {&x});
 }
@@ -615,7 +619,7 @@ TEST(gradients_of_the_heads_equal_central_differences) {
     const std::vector<float> noise = draws.normals<float>(15), moves = {2, 0, 3, 3, 1};
     std::vector<float> actions = draws.normals<float>(15);
     for (float& a : actions) a = std::tanh(a);
-    const auto policy = [&] { return Policy<double>{mean.tensor(), log_std.tensor()}; };
+    const auto policy = [&] { return Policy<double>{Head::squashed_gaussian, mean.tensor(), log_std.tensor()}; };
     Gradients gradients = {"the heads"};
     gradients.check("gaussian_log_prob", [&](auto& t) { return gaussian_log_prob(t, policy(), actions.data()); },
                     {&mean, &log_std});
@@ -779,10 +783,10 @@ void check_against_plain(double bound) {
                 const SequenceBatch batch = random_batch(draws, lengths);
                 Tape<T> tape(compute);
                 tape.recording = false;
-                const Policy<T> every = forward(tape, model, batch, Ask::every_state),
-                                last = forward(tape, model, batch, Ask::last_state);
-                CHECK_EQUAL(every.mean.rows, batch.steps());
-                CHECK_EQUAL(last.mean.rows, static_cast<int>(lengths.size()));
+                const Policy<T> every = forward(tape, model, batch, Queries::every_state),
+                                last = forward(tape, model, batch, Queries::last_state);
+                CHECK_EQUAL(every.output.rows, batch.steps());
+                CHECK_EQUAL(last.output.rows, static_cast<int>(lengths.size()));
                 const PlainTransformer<T> plain = {model};
                 const bool gaussian = head == Head::squashed_gaussian;
                 const char* names[] = {"predict_action.mu", "predict_action.logits", "predict_action.0"};
@@ -796,8 +800,9 @@ void check_against_plain(double bound) {
                             if (head == Head::deterministic) expected = std::tanh(expected);
                             for (const double logit : mean[c]) total += std::exp(logit);
                             if (head == Head::categorical) expected -= std::log(total);
-                            CHECK_CLOSE(every.mean.value[at + j], expected, bound * (1 + std::fabs(expected)));
-                            if (c + 1 == mean.size()) CHECK_EQUAL(last.mean.value[w * 2 + j], every.mean.value[at + j]);
+                            CHECK_CLOSE(every.output.value[at + j], expected, bound * (1 + std::fabs(expected)));
+                            if (c + 1 == mean.size())
+                                CHECK_EQUAL(last.output.value[w * 2 + j], every.output.value[at + j]);
                             if (!gaussian) continue;
                             const double raw = plain.affine(states, "predict_action.log_std", true)[c][j];
                             const double log_std = -5 + 0.5 * (2 - -5) * (std::tanh(raw) + 1);
@@ -816,27 +821,25 @@ TEST(gradients_of_a_whole_transformer_equal_central_differences) {
     Gradients gradients = {"the whole transformer"};
     for (const Head head : {Head::squashed_gaussian, Head::categorical, Head::deterministic})
         for (const int max_timesteps : {0, 5})
-            for (const Ask ask : {Ask::every_state, Ask::last_state}) {
+            for (const Queries queries : {Queries::every_state, Queries::last_state}) {
                 Transformer<double> model(tiny(head, max_timesteps, 0.1f), test_seed());
                 scatter(model, draws);
                 const SequenceBatch batch = random_batch(draws, {1, 3, 4});
-                const size_t asked = ask == Ask::every_state ? 8 : 3;
+                const size_t asked = queries == Queries::every_state ? 8 : 3;
                 const std::vector<float> noise = draws.normals<float>(2 * asked),
                                          coefficients = draws.normals<float>(asked);
                 std::vector<float> moves(asked);
                 for (size_t i = 0; i < asked; ++i) moves[i] = static_cast<float>(i % 2);
                 const Build build = [&](Tape<double>& tape) {
-                    const Policy<double> policy = forward(tape, model, batch, ask);
+                    const Policy<double> policy = forward(tape, model, batch, queries);
                     if (head == Head::deterministic)
-                        return weighted_sum(tape, squared_error(tape, policy.mean, batch.actions.data()),
-                                            coefficients.data());
+                        return weighted_sum(tape, log_prob(tape, policy, batch.actions.data()), coefficients.data());
                     const bool gaussian = head == Head::squashed_gaussian;
-                    const Tensor<double> likelihood = gaussian ? gaussian_log_prob(tape, policy, batch.actions.data())
-                                                               : categorical_log_prob(tape, policy.mean, moves.data());
-                    const Tensor<double> entropy = gaussian ? gaussian_entropy(tape, policy, noise.data())
-                                                            : categorical_entropy(tape, policy.mean);
+                    const float* actions = gaussian ? batch.actions.data() : moves.data();
+                    const Tensor<double> likelihood = log_prob(tape, policy, actions),
+                                         entropy_of_each = entropy(tape, policy, noise.data());
                     return combine(tape, -1.0, weighted_sum(tape, likelihood, coefficients.data()), -0.3,
-                                   weighted_sum(tape, entropy, coefficients.data()));
+                                   weighted_sum(tape, entropy_of_each, coefficients.data()));
                 };
                 std::vector<Parameter<double>*> all;
                 for (Parameter<double>& parameter : model.parameters) all.push_back(&parameter);
@@ -911,15 +914,15 @@ TEST(a_window_does_not_depend_on_its_neighbours_in_the_batch) {
         const SequenceBatch batch = random_batch(draws, {4, 1, 20, 3, 20});
         Tape<float> tape(compute);
         tape.recording = false;
-        const Policy<float> together = forward(tape, model, batch, Ask::every_state);
+        const Policy<float> together = forward(tape, model, batch, Queries::every_state);
         size_t first = 0;
         for (size_t w = 0; w < batch.lengths.size(); ++w) {
-            const Policy<float> alone = forward(tape, model, window_of(batch, w), Ask::every_state);
-            for (size_t i = 0; i < alone.mean.size(); ++i) {
-                CHECK_EQUAL(together.mean.value[first + i], alone.mean.value[i]);
+            const Policy<float> alone = forward(tape, model, window_of(batch, w), Queries::every_state);
+            for (size_t i = 0; i < alone.output.size(); ++i) {
+                CHECK_EQUAL(together.output.value[first + i], alone.output.value[i]);
                 CHECK_EQUAL(together.log_std.value[first + i], alone.log_std.value[i]);
             }
-            first += alone.mean.size();
+            first += alone.output.size();
         }
     }
 }
@@ -930,12 +933,12 @@ TEST(predictions_see_the_past_and_nothing_else) {
     scatter(model, draws);
     const SequenceBatch batch = random_batch(draws, {5});
     Tape<float> tape(serial());
-    const std::vector<float> before = values(forward(tape, model, batch, Ask::every_state).mean);
+    const std::vector<float> before = values(forward(tape, model, batch, Queries::every_state).output);
     // Which steps' predictions change when step c of an input does.
     const auto first_changed = [&](std::vector<float> SequenceBatch::*input, size_t c, size_t width) {
         SequenceBatch changed = batch;
         for (size_t j = 0; j < width; ++j) (changed.*input)[c * width + j] += 1;
-        const std::vector<float> after = values(forward(tape, model, changed, Ask::every_state).mean);
+        const std::vector<float> after = values(forward(tape, model, changed, Queries::every_state).output);
         size_t first = 0;
         while (first < 5 && before[first * action_dim] == after[first * action_dim] &&
                before[first * action_dim + 1] == after[first * action_dim + 1])
@@ -960,7 +963,7 @@ TEST(training_gives_the_same_bits_for_any_number_of_threads) {
         Compute compute(best_kernel(), threads);
         Tape<float> tape(compute);
         for (Parameter<float>& parameter : model.parameters) parameter.gradient.assign(parameter.gradient.size(), 0);
-        const Policy<float> policy = forward(tape, model, batch, Ask::every_state);
+        const Policy<float> policy = forward(tape, model, batch, Queries::every_state);
         tape.backward(weighted_sum(tape, gaussian_log_prob(tape, policy, batch.actions.data()), ones.data()));
         for (size_t p = 0; p < model.parameters.size(); ++p) {
             if (threads == 1) first.push_back(model.parameters[p].gradient);
@@ -988,7 +991,8 @@ TEST(squashed_gaussian_is_a_density_with_the_closed_form) {
     std::vector<float> a(n);
     for (int i = 0; i < n; ++i) a[static_cast<size_t>(i)] = static_cast<float>(std::tanh(14.0 * i / (n - 1) - 7));
     const double mean = 0.3, std = 0.8;
-    const Policy<double> policy = {filled(tape, n, 1, mean), filled(tape, n, 1, std::log(std))};
+    const Policy<double> policy = {Head::squashed_gaussian, filled(tape, n, 1, mean),
+                                   filled(tape, n, 1, std::log(std))};
     const Tensor<double> log_p = gaussian_log_prob(tape, policy, a.data());
     double integral = 0, entropy = 0, estimate = 0;
     for (size_t i = 0; i < n; ++i) {
@@ -1018,15 +1022,15 @@ TEST(squashed_gaussian_is_finite_at_the_extremes) {
         for (const float log_std : {-5.0f, 2.0f})
             for (const float action : {-1 + 1e-6f, 1 - 1e-6f}) {
                 Tape<float> tape(compute);
-                const Policy<float> policy = {tape.make(1, 1), tape.make(1, 1)};
-                policy.mean.value[0] = mean;
+                const Policy<float> policy = {Head::squashed_gaussian, tape.make(1, 1), tape.make(1, 1)};
+                policy.output.value[0] = mean;
                 policy.log_std.value[0] = log_std;
                 const float noise = action > 0 ? 5.8f : -5.8f;
                 const Tensor<float> log_p = gaussian_log_prob(tape, policy, &action),
                                     entropy = gaussian_entropy(tape, policy, &noise);
                 tape.backward(combine(tape, 1.0f, log_p, 1.0f, entropy));
                 for (const float x :
-                     {log_p.value[0], entropy.value[0], *policy.mean.gradient, *policy.log_std.gradient})
+                     {log_p.value[0], entropy.value[0], *policy.output.gradient, *policy.log_std.gradient})
                     CHECK(std::isfinite(x));
             }
     CHECK_CLOSE(log_tanh_slope(50.0), 2 * (std::log(2.0) - 50), 1e-13);
@@ -1349,11 +1353,10 @@ TEST(dropout_keeps_its_share_and_scales_it_up) {
     Tape<double> tape(serial());
     tape.dropout_random.seed = test_seed();
     constexpr int n = 40000;
+    const std::vector<double> ones(n, 1);
     const auto mask = [&](uint32_t site, float p) {
-        const DropoutAdd<double> finish(dropout_at(tape, site, p), {}, 8);
-        std::vector<double> x(n, 1);
-        for (int row = 0; row < n / 8; ++row) finish.forward(x.data() + 8 * row, row, 0, 8);
-        return x;
+        const Tensor<double> x = tape.constant(ones.data(), n / 8, 8);
+        return values(dropout_add(tape, x, dropout_at(tape, site, p)));
     };
     const std::vector<double> first = mask(3, 0.1f);
     const double keep = 1 / (1 - static_cast<double>(0.1f));
@@ -1380,13 +1383,18 @@ TEST(dropout_keeps_its_share_and_scales_it_up) {
 TEST(dropout_in_pieces_equals_dropout_of_the_whole) {
     const Dropout dropout = {{test_seed(), Stream::dropout}, 1, 2, 0.5f};
     const size_t n = 700;  // more than a chunk
-    std::vector<double> whole(n), pieces(n, 3), filled(n);
+    std::vector<double> whole(n), filled(n);
     dropout.fill(whole.data(), 0, n);
     for (size_t begin = 0; begin < n; begin += 7) dropout.fill(&filled[begin], begin, std::min(n - begin, size_t{7}));
     CHECK(same_bits(filled, whole));
-    for (size_t begin = 0; begin < n; begin += 350) dropout.apply(&pieces[begin], begin, 350);
-    for (double& x : whole) x *= 3;
-    CHECK(same_bits(pieces, whole));
+    Compute two(kernel_portable, 2);
+    Tape<double> tape(two);
+    const std::vector<double> threes(n * 8, 3);
+    whole.resize(n * 8);
+    dropout.fill(whole.data(), 0, n * 8);
+    const Tensor<double> x = tape.constant(threes.data(), n, 8);
+    for (double& factor : whole) factor *= 3;
+    CHECK(same_bits(values(dropout_add(tape, x, dropout)), whole));
 }
 
 TEST(dropout_places_of_a_network_are_all_different) {

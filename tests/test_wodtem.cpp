@@ -267,9 +267,9 @@ TEST(objective_is_the_equations_written_out) {
     const Batch batch = painted_batch(3, 1, 5);
     tape.recording = true;
     tape.dropout_random.seed = test_seed();
-    const Policy<double> policy = forward(tape, model, batch.sequences, Ask::every_state);
+    const Policy<double> policy = forward(tape, model, batch.sequences, Queries::every_state);
     const float lambda = 0.3f;
-    const Objective<double> got = objective(tape, Head::categorical, policy, batch, nullptr, lambda, true);
+    const Objective<double> got = objective(tape, policy, batch, nullptr, lambda, true);
 
     double L = 0, J = 0, H = 0;
     const int first_step[] = {0, 1}, steps[] = {1, 3};
@@ -277,7 +277,7 @@ TEST(objective_is_the_equations_written_out) {
         double l = 0, j = 0, h = 0;
         for (int c = first_step[window]; c < first_step[window] + steps[window]; ++c) {
             const size_t at = static_cast<size_t>(c);
-            const double* log_p = policy.mean.value + c * 5;
+            const double* log_p = policy.output.value + c * 5;
             const double w = batch.weights[at], a = log_p[static_cast<int>(batch.actions[at])],
                          a_hat = log_p[static_cast<int>(batch.remembered[at])];
             l -= w * a + (1 - w) * a_hat;
@@ -293,7 +293,7 @@ TEST(objective_is_the_equations_written_out) {
 
     Batch plain = batch;
     plain.weights.assign(4, 1.0f);
-    CHECK_CLOSE(objective(tape, Head::categorical, policy, plain, nullptr, lambda, true).L.value[0], J, 1e-6);
+    CHECK_CLOSE(objective(tape, policy, plain, nullptr, lambda, true).L.value[0], J, 1e-6);
 }
 
 // WODTEM eq. (8) test; WODTEM eq. (9) test; WODTEM eq. (10) test
@@ -313,9 +313,9 @@ TEST(objective_gradient_equals_central_differences) {
         const auto loss = [&] {  // and its gradient, in the parameters
             for (Parameter<double>& parameter : model.parameters) std::ranges::fill(parameter.gradient, 0.0);
             tape.reset();
-            const Policy<double> policy = forward(tape, model, batch.sequences, Ask::every_state);
+            const Policy<double> policy = forward(tape, model, batch.sequences, Queries::every_state);
             const Tensor<double> lagrangian =
-                objective(tape, head, policy, batch, noise.data(), 0.3f, head != Head::deterministic).lagrangian;
+                objective(tape, policy, batch, noise.data(), 0.3f, head != Head::deterministic).lagrangian;
             tape.backward(lagrangian);
             return lagrangian.value[0];
         };
@@ -478,7 +478,7 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
     float log_p[8];
     const double p[8] = {0.3, 0.05, 0.05, 0.3, 0.1, 0.1, 0.05, 0.05};
     for (int i = 0; i < 8; ++i) log_p[i] = static_cast<float>(std::log(p[i]));
-    const Policy<float> policy = {{log_p, nullptr, 1, 8}, {}};
+    const Policy<float> policy = {Head::categorical, {log_p, nullptr, 1, 8}, {}};
     const Random random = {test_seed(), Stream::exploration};
     CHECK_EQUAL(choose_action(f.run.agent, policy, 0, Act::most_likely, random, 0, 0)[0], 0.0f);
     double counts[8] = {}, chi_square = 0;
