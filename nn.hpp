@@ -858,7 +858,6 @@ struct Tape {
     Compute& compute;
     bool recording = true;  // false: acting; no gradients, no dropout
     size_t part = 0;        // the number of this part of a batch: each part has its own dropout masks
-    size_t block = 0;       // which of a parameter's gradients this tape adds to
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: fresh masks for each
     // Called with each layer's output as soon as it is computed; may be empty.
@@ -877,9 +876,6 @@ struct Tape {
         }
         return x;
     }
-
-    // Where this tape adds up the gradient of a parameter.
-    T* gradient(Tensor<T> parameter) const { return parameter.gradient + block * parameter.size(); }
 
     // Shows a layer's output to watch(), and returns it.
     Tensor<T> show(const std::string& name, Tensor<T> output) const {
@@ -1010,7 +1006,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     Compute& compute = tape.compute;
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed, true},
            x.rows, count, x.columns, Store::overwrite, {affine.bias.value + first, relu});
-    T *dw = tape.gradient(w) + offset, *db = tape.gradient(affine.bias) + first;
+    T *dw = w.gradient + offset, *db = affine.bias.gradient + first;
     tape.on_backward(y, [=, &compute] {
         // db += sum over rows of dy, which becomes the gradient before the activation on the way.
         const T* sums = block_sums<T>(compute, y.rows, count, [=](auto, ptrdiff_t row, T* sum) INLINE_LAMBDA {
@@ -1099,7 +1095,6 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
             }
         });
     });
-    T *d_weight = tape.gradient(weight), *d_bias = tape.gradient(bias);
     tape.on_backward(y, [=, &compute] {
         const Store store = next_store(x);
         // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
@@ -1118,8 +1113,8 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
             if (store == Store::overwrite) std::fill_n(dx, d, T(0));
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
-        add_column_sums(compute, d_weight, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
-        add_column_sums(compute, d_bias, sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
+        add_column_sums(compute, weight.gradient, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
+        add_column_sums(compute, bias.gradient, sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
     });
     return y;
 }
@@ -1435,7 +1430,7 @@ struct Parameter {
     std::string name;             // ODT's name in its state_dict
     std::vector<uint64_t> shape;  // as saved
     std::vector<T> value;
-    std::vector<T> gradient;  // [blocks, size]: one for each part of a batch that is worked on by itself
+    std::vector<T> gradient;  // accumulated until an update takes it
     Tensor<T> tensor() { return {value.data(), gradient.data(), rows(), static_cast<int>(shape.back())}; }
     int rows() const { return shape.size() == 1 ? 1 : static_cast<int>(shape[0]); }
 };
@@ -1516,7 +1511,6 @@ struct Transformer {
         Affine<T> c_fc, mlp_proj;
     };
     TransformerConfig config;
-    size_t gradient_blocks;
     std::vector<Parameter<T>> parameters;  // in the order of construction
     Affine<T> embed_return, embed_state, embed_action;
     Tensor<T> embed_ordering;  // [max_timesteps, width]
@@ -1526,9 +1520,7 @@ struct Transformer {
     Affine<T> predict_mean, predict_log_std;
 
     // A network with fresh parameters. Errors: nn.config for sizes that do not fit together.
-    Transformer(const TransformerConfig& c, uint32_t seed, size_t batch_parts = 1)
-        : config(c),
-          gradient_blocks(batch_parts) {
+    Transformer(const TransformerConfig& c, uint32_t seed) : config(c) {
         const int d = c.width;
         if (c.layers < 1 || c.heads < 1 || d < 1 || d % c.heads != 0)
             fail("nn.config",
@@ -1581,7 +1573,7 @@ struct Transformer {
         size_t size = 1;
         for (int extent : shape) size *= static_cast<size_t>(extent);
         parameter.value.resize(size);
-        parameter.gradient.resize(size * gradient_blocks);
+        parameter.gradient.resize(size);
         initialise(parameter, init, fan_in, seed, parameters.size());
         parameters.push_back(std::move(parameter));  // moving a vector keeps its memory: tensors stay valid
         return parameters.back().tensor();
@@ -1644,9 +1636,7 @@ void place_tokens(Tape<T>& tape, Tensor<T> tokens, const Transformer<T>& model, 
     const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
     add_rows_by_index(tape, tokens, rows, embedded, nullptr, count);
     if (max_timesteps == 0) return;
-    Tensor<T> positions = model.embed_ordering;
-    positions.gradient = tape.gradient(positions);
-    add_rows_by_index(tape, tokens, rows, positions, tape.keep(position_rows), count);
+    add_rows_by_index(tape, tokens, rows, model.embed_ordering, tape.keep(position_rows), count);
 }
 
 // The tokens R, s, a of every step, each through its own linear layer, plus the position's row: [tokens, width].
@@ -2007,22 +1997,16 @@ inline bool apply_step(float* __restrict value, float* __restrict gradient, size
     return bad == 0;
 }
 
-// Adds the gradients of all blocks, in order, to the first, empties the others, and returns the norm of all. Errors:
-// nn.not_finite names the tensor.
+// The norm of the gradient over all parameters. Errors: nn.not_finite names the tensor.
 template <class T>
-double join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
+double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
     double total = 0;
     std::vector<double> sums;
-    for (Parameter<T>& parameter : parameters) {
-        const size_t n = parameter.value.size();
+    for (const Parameter<T>& parameter : parameters) {
+        const size_t n = parameter.gradient.size();
         sums.assign(divide_up(n, update_block), 0);
         for_blocks(compute, n, update_block, [&](size_t block, size_t first, size_t count) {
-            T* const gradient = parameter.gradient.data() + first;
-            for (size_t other = n; other < parameter.gradient.size(); other += n) {
-                for (size_t i = 0; i < count; ++i) gradient[i] += gradient[other + i];
-                std::fill_n(gradient + other, count, T(0));
-            }
-            sums[block] = block_of_squares(gradient, count);
+            sums[block] = block_of_squares(parameter.gradient.data() + first, count);
         });
         const double squares = std::accumulate(sums.begin(), sums.end(), 0.0);
         if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
@@ -2037,7 +2021,7 @@ double join_gradients(Compute& compute, std::vector<Parameter<T>>& parameters) {
 // (gradient), or after (value).
 inline double update_parameters(Compute& compute, std::vector<Parameter<float>>& parameters, Optimizer& optimizer,
                                 const OptimizerConfig& config) {
-    const double norm = join_gradients(compute, parameters);
+    const double norm = gradient_norm(compute, parameters);
     // PyTorch's clip_grad_norm_: scale by limit / (norm + 1e-6) where that is below 1.
     const double scale = config.clip_norm > 0 ? std::min(1.0, config.clip_norm / (norm + 1e-6)) : 1.0;
     const double learning_rate = config.learning_rate * warmup_factor(optimizer.updates, config.warmup_updates);

@@ -593,21 +593,12 @@ struct Progress {
     }
 };
 
-// A batch is worked on in parts: results must not depend on threads, so by shape alone. Where the network is so small
-// that keeping a gradient for each part costs less than sharing out every operation, parts run side by side, each on a
-// tape of its own. Else they run one after the other on one tape, of about 2048 tokens each: what they compute is still
-// in the cache when it is wanted next, and activations take a fraction of the memory.
-struct Parts {
-    size_t count;
-    bool side_by_side;
-    size_t tapes() const { return side_by_side ? count : 1; }
-};
-
-Parts parts_of_batch(const Settings& settings) {
-    if (12 * settings.layers * settings.width * settings.width < 100000)
-        return {static_cast<size_t>(std::min<int64_t>(8, settings.batch_size)), true};
+// A batch is worked on in parts of about 2048 tokens, one after the other on one tape: what they compute is still in the
+// cache when it is wanted next, and activations take a fraction of the memory. The parts follow from the settings alone,
+// because the results depend on them.
+size_t parts_of_batch(const Settings& settings) {
     const int64_t windows = std::max<int64_t>(1, 2048 / (3 * settings.context_length));
-    return {static_cast<size_t>(divide_up(settings.batch_size, windows)), false};
+    return static_cast<size_t>(divide_up(settings.batch_size, windows));
 }
 
 struct Run {
@@ -621,27 +612,20 @@ struct Run {
 
     // What it is worked with.
     Compute& compute;
-    Parts parts;
-    std::vector<std::unique_ptr<Compute>> serial;     // one per tape, if there are several
-    std::vector<std::unique_ptr<Tape<float>>> tapes;  // one per part of a batch side by side, else one
+    Tape<float> learning;
     Tape<float> acting;
 
     Run(Compute& c, const Settings& settings, const EnvironmentSpec& spec)
         : agent{settings,
                 spec,
-                Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed),
-                                   parts_of_batch(settings).tapes()),
+                Transformer<float>(transformer_config(settings, spec), static_cast<uint32_t>(settings.seed)),
                 {}},
           temperature(settings.initial_lambda),
           replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
           memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)),
           compute(c),
-          parts(parts_of_batch(settings)),
+          learning(c),
           acting(c) {
-        for (size_t tape = 0; tape < parts.tapes(); ++tape) {
-            if (parts.tapes() > 1) serial.push_back(std::make_unique<Compute>(c.kernel, 1));
-            tapes.push_back(std::make_unique<Tape<float>>(parts.tapes() > 1 ? *serial.back() : c));
-        }
         acting.recording = false;  // and so no dropout
     }
 
@@ -832,13 +816,6 @@ void update_lambda(Compute& compute, Temperature& temperature, const Settings& s
     update_parameters(compute, temperature.log_lambda, temperature.optimizer, config);
 }
 
-// A part of the batch: its share of the objective, forward and backward.
-struct Part {
-    Batch batch;
-    double loss = 0, entropy = 0;  // its share of L and H-bar
-    std::exception_ptr problem;
-};
-
 // Standard normals for the entropy of the Gaussian head, [n, action_dim]; none for another head.
 std::vector<float> entropy_noise(const Run& run, Compute& compute, const Batch& batch) {
     const int dim = run.agent.spec.action_dim, n = static_cast<int>(batch.numbers.size());
@@ -853,50 +830,29 @@ std::vector<float> entropy_noise(const Run& run, Compute& compute, const Batch& 
     return noise;
 }
 
-void learn_part(Run& run, Part& part, uint32_t number) {
-    const uint32_t parts = static_cast<uint32_t>(run.parts.count),
-                   windows = static_cast<uint32_t>(run.agent.settings.batch_size);
-    Tape<float>& tape = *run.tapes[number % run.tapes.size()];
-    tape.reset();
-    tape.recording = true;
-    tape.part = number;
-    tape.block = number % run.tapes.size();
-    tape.dropout_random = run.random(Stream::dropout);
-    tape.dropout_step = run.progress.updates;
-    part.batch = sample_batch(run, windows * number / parts, windows * (number + 1) / parts);
-    consult_memory(run, part.batch);
-
-    const std::vector<float> noise = entropy_noise(run, tape.compute, part.batch);
-    const Objective<float> result =
-        learn(tape, run.agent.model, part.batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
-    part.loss = result.L.value[0];
-    if (run.constrains_entropy()) part.entropy = result.H.value[0];
-}
-
 // WODTEM sec. IV-B.3, step 3: "alternately optimizing" eq. (8), on one batch: a step of theta, then one of lambda with
 // the entropy of the same pass.
 void update(Run& run) {
-    std::vector<Part> parts(run.parts.count);
-    const auto learn = [&](int number, int) {
-        Part& part = parts[static_cast<size_t>(number)];
-        try {
-            learn_part(run, part, static_cast<uint32_t>(number));
-        } catch (...) {
-            part.problem = std::current_exception();
-        }
-    };
-    if (run.parts.side_by_side) {
-        run.compute.threads.run(static_cast<int>(parts.size()), learn);
-    } else {
-        const FrozenWeights frozen(run.compute);
-        for (size_t part = 0; part < parts.size(); ++part) learn(static_cast<int>(part), 0);
-    }
     double loss = 0, entropy = 0;
-    for (const Part& part : parts) {
-        if (part.problem) std::rethrow_exception(part.problem);
-        count_consultation(run, part.batch);
-        loss += part.loss;
-        entropy += part.entropy;
+    const uint32_t parts = static_cast<uint32_t>(parts_of_batch(run.agent.settings)),
+                   windows = static_cast<uint32_t>(run.agent.settings.batch_size);
+    Tape<float>& tape = run.learning;
+    tape.dropout_random = run.random(Stream::dropout);
+    tape.dropout_step = run.progress.updates;
+    {
+        const FrozenWeights frozen(run.compute);
+        for (uint32_t part = 0; part < parts; ++part) {
+            tape.reset();
+            tape.part = part;
+            Batch batch = sample_batch(run, windows * part / parts, windows * (part + 1) / parts);
+            consult_memory(run, batch);
+            const std::vector<float> noise = entropy_noise(run, run.compute, batch);
+            const Objective<float> result =
+                learn(tape, run.agent.model, batch, noise.data(), run.temperature.lambda(), run.constrains_entropy());
+            count_consultation(run, batch);
+            loss += result.L.value[0];
+            if (run.constrains_entropy()) entropy += result.H.value[0];
+        }
     }
     if (!std::isfinite(loss + entropy))
         fail("nn.not_finite", "the loss (%g) or the entropy (%g) is not finite", loss, entropy);

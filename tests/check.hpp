@@ -1510,7 +1510,7 @@ void check_step(Case& c) {
             const double norm = update_parameters(c.compute, model->parameters, optimizer, optimizer_settings);
             const double clip = settings.clip_norm > 0 ? std::min(1.0, settings.clip_norm / (norm + 1e-6)) : 1.0;
             slack->add(before, off, clip, optimizer, optimizer_settings);
-            lists["gradient_norm"].add(norm, unrounded ? join_gradients(c.compute, unrounded->parameters) : norm);
+            lists["gradient_norm"].add(norm, unrounded ? gradient_norm(c.compute, unrounded->parameters) : norm);
             if (constrain)
                 lambda.step(c, settings, here[1],
                             c.tolerance("H").float32 * std::fabs(here[1]) + std::fabs(here[1] - there[1]));
