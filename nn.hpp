@@ -71,30 +71,22 @@ using Words4 = std::array<uint32_t, 4>;
 // The loops over the counters are plain so that the compiler turns them into vectors.
 template <uint32_t Count>
 void philox_words(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
-    uint32_t c0[Count], c1[Count], c2[Count], c3[Count];
-    for (uint32_t i = 0; i < Count; ++i) {
-        c0[i] = counter[0] + i;
-        c1[i] = counter[1];
-        c2[i] = counter[2];
-        c3[i] = counter[3];
-    }
+    uint32_t c[4][Count];
+    for (size_t word = 0; word < 4; ++word) std::fill_n(c[word], Count, counter[word]);
+    for (uint32_t i = 0; i < Count; ++i) c[0][i] += i;
     for (int round = 0; round < 10; ++round) {
         for (uint32_t i = 0; i < Count; ++i) {
-            const uint64_t product0 = uint64_t{0xD2511F53} * c0[i], product1 = uint64_t{0xCD9E8D57} * c2[i];
-            c0[i] = static_cast<uint32_t>(product1 >> 32) ^ c1[i] ^ key0;
-            c2[i] = static_cast<uint32_t>(product0 >> 32) ^ c3[i] ^ key1;
-            c1[i] = static_cast<uint32_t>(product1);
-            c3[i] = static_cast<uint32_t>(product0);
+            const uint64_t product0 = uint64_t{0xD2511F53} * c[0][i], product1 = uint64_t{0xCD9E8D57} * c[2][i];
+            c[0][i] = static_cast<uint32_t>(product1 >> 32) ^ c[1][i] ^ key0;
+            c[2][i] = static_cast<uint32_t>(product0 >> 32) ^ c[3][i] ^ key1;
+            c[1][i] = static_cast<uint32_t>(product1);
+            c[3][i] = static_cast<uint32_t>(product0);
         }
         key0 += 0x9E3779B9;  // golden ratio
         key1 += 0xBB67AE85;  // sqrt(3) - 1
     }
-    for (uint32_t i = 0; i < Count; ++i) {
-        words[4 * i] = c0[i];
-        words[4 * i + 1] = c1[i];
-        words[4 * i + 2] = c2[i];
-        words[4 * i + 3] = c3[i];
-    }
+    for (uint32_t i = 0; i < Count; ++i)
+        for (size_t word = 0; word < 4; ++word) words[4 * i + word] = c[word][i];
 }
 
 // One counter's 128 bits.
@@ -143,7 +135,8 @@ struct Random {
     }
 
     // Standard normal by Box and Muller, from words 2 and 3; 24 bits reach 5.8 standard deviations.
-    // @LIBM@
+    // logf and cosf of glibc 2.36 give the same bits with FMA instructions and without, measured over all 2^24 values of u
+    // and of the angle; the double functions of libm do not. Another library may differ in the last bit.
     float normal(uint64_t step, uint32_t index, uint32_t site = 0) const {
         const Words4 w = words(step, index, site);
         const float u = (static_cast<float>(w[2] >> 8) + 1.0f) * 0x1p-24f;  // (0, 1]
@@ -467,37 +460,31 @@ ALWAYS_INLINE void transpose_4x4(float* to, int to_stride, const float* from, in
     lanes_at<4>(to + 3 * stride) = __builtin_shufflevector(c, d, 2, 3, 6, 7);
 }
 
-// PackFunction for floats: the panel is [depth, width].
-inline void pack_floats(float* panel, int width, View<const float> view, int first_k, int first_line, int depth,
-                        int used) {
+// PackFunction for floats: the panel is [depth, Width].
+template <int Width>
+void pack_floats(void* to, View<const float> view, int first_k, int first_line, int depth, int used) {
+    float* const panel = static_cast<float*>(to);
+    if (used < Width) std::fill_n(panel, depth * Width, 0.0f);
     if (!view.transposed) {  // the lines lie side by side: copy along them
         for (int k = 0; k < depth; ++k) {
             const float* row = &view(first_k + k, first_line);
-            for (int line = 0; line < used; ++line) panel[k * width + line] = row[line];
+            for (int line = 0; line < used; ++line) panel[k * Width + line] = row[line];
         }
-    } else {  // the lines lie along k: transpose blocks of 4 x 4
-        for (int first = 0; first < used; first += 4) {
-            const int lines = std::min(4, used - first), whole = lines == 4 ? depth / 4 * 4 : 0;
-            for (int k = 0; k < whole; k += 4)
-                transpose_4x4(panel + k * width + first, width, &view(first_k + k, first_line + first), view.stride);
-            for (int line = first; line < first + lines; ++line)
-                for (int k = whole; k < depth; ++k) panel[k * width + line] = view(first_k + k, first_line + line);
-        }
+        return;
     }
-    for (int k = 0; used < width && k < depth; ++k)
-        for (int line = used; line < width; ++line) panel[k * width + line] = 0;
-}
-
-template <int Width>
-void pack_floats_of(void* panel, View<const float> view, int first_k, int first_line, int depth, int used) {
-    pack_floats(static_cast<float*>(panel), Width, view, first_k, first_line, depth, used);
+    for (int first = 0; first < used; first += 4) {  // the lines lie along k: transpose blocks of 4 x 4
+        const int lines = std::min(4, used - first), whole = lines == 4 ? depth / 4 * 4 : 0;
+        for (int k = 0; k < whole; k += 4)
+            transpose_4x4(panel + k * Width + first, Width, &view(first_k + k, first_line + first), view.stride);
+        for (int line = first; line < first + lines; ++line)
+            for (int k = whole; k < depth; ++k) panel[k * Width + line] = view(first_k + k, first_line + line);
+    }
 }
 
 // The record of a kernel for floats with tiles of Rows x Columns.
 template <int Rows, int Columns>
 constexpr Kernel float_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
-    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_floats_of<Rows>, pack_floats_of<Columns>,
-            tile};
+    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_floats<Rows>, pack_floats<Columns>, tile};
 }
 
 #ifdef X86_KERNELS
@@ -529,13 +516,6 @@ inline const Kernel* const kernels[] = {
 // The fastest kernel that this machine supports.
 inline const Kernel& best_kernel() {
     return **std::find_if(std::begin(kernels), std::end(kernels), [](const Kernel* k) { return k->supported(); });
-}
-
-// The kernel of this name, or null if there is none or this machine does not support it.
-inline const Kernel* find_kernel(const std::string& name) {
-    for (const Kernel* kernel : kernels)
-        if (name == kernel->name && kernel->supported()) return kernel;
-    return nullptr;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1119,8 +1099,8 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
     return y;
 }
 
-// Inverted dropout's factors for the elements of one place in the network: 0 with probability p, 1 / (1 - p) else. They
-// come from the counter (update, place, element), so backward may compute them again.
+// Inverted dropout of the elements of one place in the network: each is multiplied by 0 with probability p, by
+// 1 / (1 - p) else. The factors come from the counter (update, place, element).
 struct Dropout {
     Random random;
     uint64_t step;
@@ -1130,16 +1110,18 @@ struct Dropout {
     // factor [n] of the elements [first, first + n). Element e has word e % 4 of counter e / 4.
     template <class T>
     void fill(T* factor, size_t first, size_t n) const {
+        if (probability == 0) {
+            std::fill_n(factor, n, T(1));
+            return;
+        }
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
+        constexpr size_t counters = 32;
         for (size_t i = 0; i < n;) {
-            constexpr size_t counters = 32;
             uint32_t words[4 * counters];
             random.many_words<counters>(words, step, static_cast<uint32_t>((first + i) / 4), site);
             const size_t skip = (first + i) % 4, count = std::min(4 * counters - skip, n - i);
-            vectorised<T>([&](auto) INLINE_LAMBDA {
-                for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
-            });
+            for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
             i += count;
         }
     }
@@ -1152,48 +1134,50 @@ Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
     return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
+// The factors of [rows, columns] elements; they last until the tape is reset.
+template <class T>
+const T* dropout_factors(Tape<T>& tape, const Dropout& dropout, int rows, ptrdiff_t columns) {
+    T* const factors = tape.template scratch<T>(rows * columns);
+    for_rows(tape.compute, rows, static_cast<int>(8 * columns), [=](int begin, int end, int) {
+        dropout.fill(factors + begin * columns, begin * columns, (end - begin) * columns);
+    });
+    return factors;
+}
+
+// x's gradient += dy * factor, element by element; factor null: += dy.
+template <class T>
+void add_product(Compute& compute, Tensor<T> x, const T* dy, const T* factor) {
+    const Store store = next_store(x);
+    for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
+        const ptrdiff_t first = static_cast<ptrdiff_t>(begin) * x.columns,
+                        last = static_cast<ptrdiff_t>(end) * x.columns;
+        vectorised<T>([=](auto) INLINE_LAMBDA {
+            for (ptrdiff_t i = first; i < last; ++i) {
+                const T product = factor ? dy[i] * factor[i] : dy[i];
+                x.gradient[i] = store == Store::overwrite ? product : x.gradient[i] + product;
+            }
+        });
+    });
+}
+
 // dropout(x) + residual, [n, d]; without the sum if the residual is empty.
 template <class T>
 Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor<T> residual = {}) {
     if (dropout.probability == 0 && !residual.value) return x;
     const Tensor<T> y = tape.make(x.rows, x.columns);
     const ptrdiff_t d = x.columns;
+    const T* const factor = dropout_factors(tape, dropout, x.rows, d);
     Compute& compute = tape.compute;
-    // Calls f(first, count, factor) for stretches of at most `stretch` elements; factor [count].
-    const auto for_stretches = [=, &compute](auto&& f) {
-        for_rows(compute, x.rows, 8 * x.columns, [&](int begin, int end, int) {
-            constexpr ptrdiff_t stretch = 1024;
-            T factor[stretch];
-            std::fill_n(factor, stretch, T(1));
-            for (ptrdiff_t first = begin * d; first < end * d; first += stretch) {
-                const ptrdiff_t count = std::min(end * d - first, stretch);
-                if (dropout.probability > 0) dropout.fill(factor, first, count);
-                f(first, count, factor);
-            }
-        });
-    };
-    for_stretches([=](ptrdiff_t first, ptrdiff_t count, const T* factor) {
+    for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
         vectorised<T>([=](auto) INLINE_LAMBDA {
-            const T *in = x.value + first, *added = residual.value + first;
-            T* out = y.value + first;
-            for (ptrdiff_t i = 0; i < count; ++i) out[i] = in[i] * factor[i];
+            for (ptrdiff_t i = begin * d; i < end * d; ++i) y.value[i] = x.value[i] * factor[i];
             if (residual.value)
-                for (ptrdiff_t i = 0; i < count; ++i) out[i] += added[i];
+                for (ptrdiff_t i = begin * d; i < end * d; ++i) y.value[i] += residual.value[i];
         });
     });
-    tape.on_backward(y, [=] {
-        const Store to_x = next_store(x), to_residual = next_store(residual);
-        for_stretches([=](ptrdiff_t first, ptrdiff_t count, const T* factor) {
-            vectorised<T>([=](auto) INLINE_LAMBDA {
-                const T* dy = y.gradient + first;
-                T *dx = x.gradient + first, *d_residual = residual.gradient + first;
-                if (to_x == Store::overwrite) std::fill_n(dx, count, T(0));
-                for (ptrdiff_t i = 0; i < count; ++i) dx[i] += dy[i] * factor[i];
-                if (!residual.gradient) return;
-                if (to_residual == Store::overwrite) std::fill_n(d_residual, count, T(0));
-                for (ptrdiff_t i = 0; i < count; ++i) d_residual[i] += dy[i];
-            });
-        });
+    tape.on_backward(y, [=, &compute] {
+        add_product(compute, x, y.gradient, factor);
+        if (residual.gradient) add_product<T>(compute, residual, y.gradient, nullptr);
     });
     return y;
 }
@@ -1286,19 +1270,12 @@ struct AttentionPass {
     int d, size, heads;      // width of all heads and of one
     int longest;             // sequence of the batch, in tokens
     T *weights, *d_weights;  // [queries, heads, longest] after the softmax, before dropout
-    T* factors;              // [queries, heads, longest] of dropout; null: none
+    const T* factors;        // [queries, heads, longest] of dropout
     T scale;                 // 1 / sqrt(size)
 
     // How many tokens query i sees: its own sequence up to and with itself.
     int seen_by(ptrdiff_t i, const Span& span) const { return position[i] - span.first_token + 1; }
     ptrdiff_t head_at(ptrdiff_t i, ptrdiff_t h) const { return (i * heads + h) * longest; }
-
-    // dropout(weights) of a query: the weights themselves, or their product with the factors, in `room` [longest].
-    const T* dropped(ptrdiff_t at, int seen, T* room) const {
-        if (!factors) return weights + at;
-        for (int j = 0; j < seen; ++j) room[j] = factors[at + j] * weights[at + j];
-        return room;
-    }
 
     // rows [longest, size], room [longest]: scratch memory.
     template <int Width>
@@ -1314,8 +1291,8 @@ struct AttentionPass {
         gather_rows(rows, keys + d, stride, span.tokens, size);  // values
         for (ptrdiff_t i = span.first_query; i < end; ++i) {
             const int seen = seen_by(i, span);
-            const T* const w = dropped(head_at(i, h), seen, room);
-            add_weighted_rows<Width>(out.value + i * d + h * size, w, 1, rows, seen, size, Store::overwrite);
+            for (int j = 0; j < seen; ++j) room[j] = factors[head_at(i, h) + j] * weights[head_at(i, h) + j];
+            add_weighted_rows<Width>(out.value + i * d + h * size, room, 1, rows, seen, size, Store::overwrite);
         }
     }
 
@@ -1327,14 +1304,13 @@ struct AttentionPass {
         for (ptrdiff_t i = first; i < end; ++i) {
             const int seen = seen_by(i, span);
             T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
+            const T* const factor = factors + head_at(i, h);
             // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
             dot_rows<Width>(dw, out.gradient + i * d + column, rows, seen, size, T(1));
-            if (factors)
-                for (int j = 0; j < seen; ++j) dw[j] *= factors[head_at(i, h) + j];
+            for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
             const T mean = dot<Width>(w, dw, seen);
             for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
-            if (factors)  // the weights from here on are those after dropout
-                for (int j = 0; j < seen; ++j) w[j] *= factors[head_at(i, h) + j];
+            for (int j = 0; j < seen; ++j) w[j] *= factor[j];  // from here on after dropout
         }
         // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
         gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
@@ -1392,12 +1368,8 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span*
     const size_t all = static_cast<size_t>(q.rows * query_size);
     T* const weights = tape.template scratch<T>(all);
     T* const d_weights = tape.recording ? tape.template scratch<T>(all) : nullptr;
-    T* const factors = dropout.probability > 0 ? tape.template scratch<T>(all) : nullptr;
+    const T* const factors = dropout_factors(tape, dropout, q.rows, query_size);
     Compute& compute = tape.compute;
-    if (factors)  // for whole rows of weights, those of unseen tokens among them, as one stretch of the counter
-        for_rows(compute, q.rows, static_cast<int>(8 * query_size), [=](int begin, int end, int) {
-            dropout.fill(factors + begin * query_size, begin * query_size, (end - begin) * query_size);
-        });
     const AttentionPass<T> pass = {q,     kv,      out,     position,  d,       size,
                                    heads, longest, weights, d_weights, factors, T(1) / std::sqrt(T(size))};
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
