@@ -546,11 +546,10 @@ struct PackedWeights {
 
 // Threads, kernel and scratch memory: what every operation below needs in order to run.
 struct Compute {
-    static constexpr int block_rows = 192;            // of A, that a task packs: fits a core's second cache
-    static constexpr size_t stretch_bytes = 4 << 20;  // of B that is packed at a time: fits the cache that cores share
+    static constexpr int block_rows = 192;  // of A, that a task packs: fits a core's second cache
     const Kernel& kernel;
     Threads threads;
-    Buffer packed_b;  // a stretch of B, in panels
+    Buffer packed_b;
     PackedWeights packed_weights;
     std::vector<Buffer> scratch;  // one per worker, for a task: a block of A in panels, a head's rows
     Buffer sums;                  // of block_sums
@@ -628,82 +627,52 @@ inline void multiply_block(const Kernel& kernel, Buffer& scratch, View<float> c,
         }
 }
 
-// How C is cut into blocks for tasks: blocks of rows; for a wide C with few rows also of columns. Blocks are as equal
-// as whole tiles allow.
-struct Blocks {
-    int M, N, tile_rows, tile_columns;
-    int tiles, panels;  // of M rows and of N columns
-    int row_blocks, column_blocks;
-
-    Blocks(const Kernel& kernel, int threads, int rows, int columns)
-        : M(rows),
-          N(columns),
-          tile_rows(kernel.tile_rows),
-          tile_columns(kernel.tile_columns),
-          tiles(divide_up(rows, kernel.tile_rows)),
-          panels(divide_up(columns, kernel.tile_columns)) {
-        const int fewest = std::max(divide_up(tiles, Compute::block_rows / tile_rows), 4);
-        row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
-        column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
-    }
-    int count() const { return row_blocks * column_blocks; }
-    Block operator[](int task) const {
-        const int i = task / column_blocks, j = task % column_blocks;
-        return {first_row(i), first_row(i + 1), first_column(j), first_column(j + 1)};
-    }
-    int first_row(int block) const { return std::min(M, tiles * block / row_blocks * tile_rows); }
-    int first_column(int block) const { return std::min(N, panels * block / column_blocks * tile_columns); }
-};
-
-// The fast version of matmul_plain, then the epilogue. B is packed in steps of sum_block k, as many at a time as a
-// stretch holds; a frozen weight is one stretch and is packed once.
+// The fast version of matmul_plain, then the epilogue. Two rounds of tasks: B is packed, in steps of sum_block k; then
+// each task computes a block of C, packing its rows of A on the way. A frozen weight is packed once for many products.
 inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
                    Store store, Epilogue<float> epilogue = {}) {
     if (M == 0 || N == 0) return;
-    if (K == 0) {  // an empty sum
-        if (store == Store::overwrite)
-            for (int i = 0; i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
-        return apply_epilogue(c, epilogue, {0, M, 0, N});
-    }
+    if (K == 0 && store == Store::overwrite)  // an empty sum
+        for (int i = 0; i < M; ++i) std::fill_n(&c(i, 0), N, 0.0f);
     const Kernel& kernel = compute.kernel;
+    const int threads = compute.threads.count();
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
-    const Blocks blocks(kernel, compute.threads.count(), M, N);
-    PackedWeights::Entry* const cached = b.weight && compute.packed_weights.frozen
-                                             ? &compute.packed_weights.entries[{b.data, b.stride, b.transposed, K, N}]
-                                             : nullptr;
-    const bool packed_before = cached && cached->valid;
-    const size_t step_bytes = kernel.panel_bytes(blocks.panels * kernel.tile_columns, std::min(K, sum_block));
-    const int all_steps = divide_up(K, sum_block);
-    const int fitting_steps = std::clamp(static_cast<int>(Compute::stretch_bytes / step_bytes), 1, all_steps);
-    const int stretch = (cached ? all_steps : fitting_steps) * sum_block;  // k at a time
-    char* const packed =
-        (cached ? cached->panels : compute.packed_b).room(step_bytes * divide_up(std::min(K, stretch), sum_block));
-    const int panels_a_task = std::max(1, blocks.panels / 8);
-    const int tasks_a_step = divide_up(blocks.panels, panels_a_task);
+    // C in tiles, tiles in blocks: of rows, and for a wide C with few rows also of columns, as equal as tiles allow.
+    const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
+    const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4);
+    const int row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
+    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
 
-    for (int first_k = 0; first_k < K; first_k += stretch) {
-        const int end_k = std::min(K, first_k + stretch);
-        const auto depth_at = [&](int k) { return std::min(sum_block, end_k - k); };
-        const auto pack_some_panels = [&](int task, int) {
-            const int step = task / tasks_a_step, k = first_k + step * sum_block;
-            const int line = task % tasks_a_step * panels_a_task * kernel.tile_columns;
-            pack_panels(kernel, kernel.pack_b, kernel.tile_columns,
-                        packed + step * step_bytes + kernel.panel_bytes(line, depth_at(k)), b, k, depth_at(k), line,
-                        std::min(N, line + panels_a_task * kernel.tile_columns));
-        };
-        if (!packed_before)
-            compute.threads.run(divide_up(end_k - first_k, sum_block) * tasks_a_step, pack_some_panels, serial);
-        const auto multiply = [&](int task, int worker) {
-            const Block block = blocks[task];
-            for (int k = first_k; k < end_k; k += sum_block)
-                multiply_block(kernel, compute.scratch[static_cast<size_t>(worker)], c, a,
-                               packed + (k - first_k) / sum_block * step_bytes, block, k, depth_at(k),
-                               k > 0 ? Store::accumulate : store);
-            if (end_k == K) apply_epilogue(c, epilogue, block);
-        };
-        compute.threads.run(blocks.count(), multiply, serial);
-    }
+    PackedWeights& weights = compute.packed_weights;
+    PackedWeights::Entry* cached = nullptr;
+    if (b.weight && weights.frozen) cached = &weights.entries[{b.data, b.stride, b.transposed, K, N}];
+    Buffer& buffer = cached ? cached->panels : compute.packed_b;
+    const bool packed_before = cached && cached->valid;
+    const int steps = divide_up(K, sum_block), panels_a_task = std::max(1, panels / 8);
+    const int tasks_a_step = divide_up(panels, panels_a_task);
+    const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, sum_block));
+    char* const packed = buffer.room(step_bytes * steps);
+    const auto pack_some_panels = [&](int task, int) {
+        const int step = task / tasks_a_step, first_k = step * sum_block, depth = std::min(sum_block, K - first_k);
+        const int line = task % tasks_a_step * panels_a_task * kernel.tile_columns;
+        const int end_line = std::min(N, line + panels_a_task * kernel.tile_columns);
+        char* const to = packed + step * step_bytes + kernel.panel_bytes(line, depth);
+        pack_panels(kernel, kernel.pack_b, kernel.tile_columns, to, b, first_k, depth, line, end_line);
+    };
+    if (!packed_before) compute.threads.run(steps * tasks_a_step, pack_some_panels, serial);
     if (cached) cached->valid = true;
+
+    const auto multiply = [&](int task, int worker) {
+        const int i = task / column_blocks, j = task % column_blocks;
+        const auto row = [&](int n) { return std::min(M, tiles * n / row_blocks * kernel.tile_rows); };
+        const auto column = [&](int n) { return std::min(N, panels * n / column_blocks * kernel.tile_columns); };
+        const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
+        for (int step = 0; step < steps; ++step)
+            multiply_block(kernel, compute.scratch[worker], c, a, packed + step * step_bytes, block, step * sum_block,
+                           std::min(sum_block, K - step * sum_block), step > 0 ? Store::accumulate : store);
+        apply_epilogue(c, epilogue, block);
+    };
+    compute.threads.run(row_blocks * column_blocks, multiply, serial);
 }
 
 // In double, for checks alone.
@@ -1056,9 +1025,9 @@ template <class T>
 Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
     const int d = x.columns;
     const Tensor<T> y = tape.make(x.rows, d), weight = norm.weight, bias = norm.bias;
-    T* means = tape.template scratch<T>(static_cast<size_t>(x.rows));   // [n]
-    T* scales = tape.template scratch<T>(static_cast<size_t>(x.rows));  // [n] 1 / sqrt(variance + 1e-5)
-    T* ones = tape.template scratch<T>(static_cast<size_t>(d));         // [d]: a sum is a dot product with ones
+    T* means = tape.template scratch<T>(x.rows);   // [n]
+    T* scales = tape.template scratch<T>(x.rows);  // [n] 1 / sqrt(variance + 1e-5)
+    T* ones = tape.template scratch<T>(d);         // [d]: a sum is a dot product with ones
     std::fill_n(ones, d, T(1));
     Compute& compute = tape.compute;
     for_rows(compute, x.rows, 8 * d, [=](int begin, int end, int) {
@@ -1186,18 +1155,18 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
 // q, k, v [n, d] of one sequence. The specification; `attention` below is held to it.
 template <class T>
 void attention_plain(T* out, const T* q, const T* k, const T* v, int n, int d) {
-    std::vector<T> weight(static_cast<size_t>(n));
+    std::vector<T> weight(n);
     for (int i = 0; i < n; ++i) {
         T total = 0;
         for (int j = 0; j <= i; ++j) {
             T score = 0;
             for (int c = 0; c < d; ++c) score += q[i * d + c] * k[j * d + c];
-            weight[static_cast<size_t>(j)] = std::exp(score / std::sqrt(T(d)));
-            total += weight[static_cast<size_t>(j)];
+            weight[j] = std::exp(score / std::sqrt(T(d)));
+            total += weight[j];
         }
         for (int c = 0; c < d; ++c) {
             out[i * d + c] = 0;
-            for (int j = 0; j <= i; ++j) out[i * d + c] += weight[static_cast<size_t>(j)] / total * v[j * d + c];
+            for (int j = 0; j <= i; ++j) out[i * d + c] += weight[j] / total * v[j * d + c];
         }
     }
 }
@@ -1345,7 +1314,7 @@ void for_heads(Compute& compute, const AttentionPass<T>& pass, const Span* spans
                const F& f) {
     for_rows(compute, span_count, work, [&](int begin, int end, int worker) {
         const size_t floats = static_cast<size_t>(pass.longest) * static_cast<size_t>(pass.size + 1);
-        T* const rows = reinterpret_cast<T*>(compute.scratch[static_cast<size_t>(worker)].room(floats * sizeof(T)));
+        T* const rows = reinterpret_cast<T*>(compute.scratch[worker].room(floats * sizeof(T)));
         vectorised<T>([&](auto lanes) INLINE_LAMBDA {
             for (int s = begin; s < end; ++s)
                 for (int h = 0; h < pass.heads; ++h) f(lanes, spans[s], h, rows, rows + pass.longest * pass.size);
@@ -1645,7 +1614,7 @@ inline uint32_t dropout_site(int layer, int place) { return static_cast<uint32_t
 template <class T>
 Tensor<T> transformer_block(Tape<T>& tape, const Transformer<T>& model, int layer, Tensor<T> x,
                             const std::vector<Span>& spans, const std::vector<int>& queries) {
-    const typename Transformer<T>::Block& block = model.blocks[static_cast<size_t>(layer)];
+    const typename Transformer<T>::Block& block = model.blocks[layer];
     const int d = model.config.width, count = static_cast<int>(queries.size());
     const auto dropout = [&](int place) { return dropout_at(tape, dropout_site(layer, place), model.config.dropout); };
     const int* rows = tape.keep(queries);
@@ -1919,7 +1888,7 @@ double block_of_squares(const T* x, size_t n) {
 template <class F>
 void for_blocks(Compute& compute, size_t n, int work, F&& f) {
     for_rows(compute, static_cast<int>(divide_up(n, update_block)), work, [&](int begin, int end, int) {
-        for (size_t b = static_cast<size_t>(begin); b < static_cast<size_t>(end); ++b)
+        for (size_t b = begin; b < static_cast<size_t>(end); ++b)
             f(b, b * update_block, std::min(n - b * update_block, update_block));
     });
 }
