@@ -612,6 +612,7 @@ struct Run {
 
     // What it is worked with.
     Compute& compute;
+    size_t parts;  // of a batch
     Tape<float> learning;
     Tape<float> acting;
 
@@ -624,6 +625,7 @@ struct Run {
           replay{spec.state_dim, spec.action_dim, settings.gamma, static_cast<size_t>(settings.buffer_size), {}, 0, {}},
           memory(memory_config(settings, spec), static_cast<uint32_t>(settings.seed)),
           compute(c),
+          parts(parts_of_batch(settings)),
           learning(c),
           acting(c) {
         acting.recording = false;  // and so no dropout
@@ -834,7 +836,7 @@ std::vector<float> entropy_noise(const Run& run, Compute& compute, const Batch& 
 // the entropy of the same pass.
 void update(Run& run) {
     double loss = 0, entropy = 0;
-    const uint32_t parts = static_cast<uint32_t>(parts_of_batch(run.agent.settings)),
+    const uint32_t parts = static_cast<uint32_t>(run.parts),
                    windows = static_cast<uint32_t>(run.agent.settings.batch_size);
     Tape<float>& tape = run.learning;
     tape.dropout_random = run.random(Stream::dropout);

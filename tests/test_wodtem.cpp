@@ -441,10 +441,11 @@ TEST(a_batch_in_parts_is_the_batch_as_a_whole) {
     for (auto [name, value] : {std::pair{"dropout", "0"}, {"context_length", "3"}, {"batch_size", "30"}})
         set_setting(settings, name, value);
     Fixture whole(settings), parts(settings);
-    whole.run.parts = {1, false};
-    parts.run.parts = {7, false};
+    whole.run.parts = 1;
+    parts.run.parts = 7;
     for (int i = 0; i < 3; ++i) {
-        update(whole.run), update(parts.run);
+        update(whole.run);
+        update(parts.run);
         CHECK_CLOSE(parts.run.progress.loss, whole.run.progress.loss, 1e-5);
         CHECK_CLOSE(parts.run.progress.entropy, whole.run.progress.entropy, 1e-5);
         CHECK_EQUAL(parts.run.progress.pairs, whole.run.progress.pairs);
