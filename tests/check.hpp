@@ -1,11 +1,13 @@
-// check.hpp: `wodtem check FILE...`: recomputes golden vectors with the functions that training uses, and compares.
+// check.hpp: `wodtem check FILE...` recomputes golden vectors with the functions that training uses, and compares.
 // Included by wodtem.cpp. tests/vectors/README.md describes the files, well enough to write new ones by hand.
 //
-// In order: cases (inputs by name, outputs held against what the file expects, each within its stated tolerance); one
-// function for each topic, in porting order; the table of topics; files.
-// Promises: files are untrusted: what is missing, unknown, of another shape or not counted is a sentence with file,
-// tensor and offset; every size and setting of a case comes from the file. Where code is templated on the scalar, a
-// case is computed in double and in float. Leaves out: making vectors (tests/vectors/peer.py shares nothing with this).
+// In order: cases (inputs by name; outputs are compared with the file's, each within its stated tolerance); one function
+// for each topic, in porting order; the table of topics; files.
+// Promises: files are untrusted. What is missing, unknown, of another shape or not counted is reported in a sentence
+// with file, tensor and offset. Every size and setting of a case comes from the file and is held to a range. Where the
+// code is templated on the scalar, a case is computed in double and in float.
+// Leaves out: making vectors, which tests/vectors/peer.py does and shares no code with this.
+// Words: in messages "file" is the number that the vector file holds, "wodtem" the one that this program computes.
 #pragma once
 
 namespace vectors {
@@ -15,36 +17,30 @@ namespace vectors {
 
 enum class Precision { float64, float32 };
 
-// |got - expected| <= bound * (largest |expected| of the tensor) + absolute; exact: equal numbers.
+// |wodtem - file| <= bound * (largest |file| of the tensor) + absolute; exact: equal numbers.
 struct Tolerance {
     bool exact = false;
     double float64 = 1e-10, float32 = 1e-5, absolute = 0;
 };
 
-// "exact: REASON", or numbers: "float64 1e-12, float32 3e-6, absolute 1e-9: REASON", each once. One without a word, which
-// comes first, is float64's, and float32's too if it is above 2^-24, one rounding.
+// Reads "exact: REASON" or "float64 1e-12, float32 3e-6, absolute 1e-9: REASON", any of the three words, once each.
+// Errors: check.tolerance.
 Tolerance parse_tolerance(const std::string& text, const std::string& where) {
     Tolerance tolerance;
     const size_t colon = text.find(':');
-    if (text.substr(0, colon) == "exact" && colon != std::string::npos) return {true, 0, 0, 0};
     bool good = colon != std::string::npos;
-    std::set<std::string> words;
+    if (good && text.substr(0, colon) == "exact") return {true, 0, 0, 0};
+    std::map<std::string, double*> words = {
+        {"float64", &tolerance.float64}, {"float32", &tolerance.float32}, {"absolute", &tolerance.absolute}};
     for (const std::string& item : split(text.substr(0, colon), ',')) {
         std::vector<std::string> parts = split(item, ' ');
         std::erase(parts, "");
-        const bool bare = parts.size() == 1;
-        const std::string word = parts.size() == 2 ? parts[0] : "float64";
-        const auto x = bare || parts.size() == 2 ? to_number(parts.back()) : std::nullopt;
-        good = good && x && *x >= 0 && (!bare || words.empty()) && words.insert(word).second;
-        if (good && word == "absolute")
-            tolerance.absolute = *x;
-        else if (good && word == "float64")
-            tolerance.float64 = *x;
-        else if (good && word == "float32")
-            tolerance.float32 = *x;
-        else
-            good = false;
-        if (good && bare && *x > 0x1p-24) tolerance.float32 = *x;
+        const auto word = parts.size() == 2 ? words.find(parts[0]) : words.end();
+        const auto x = parts.size() == 2 ? to_number(parts[1]) : std::nullopt;
+        good = good && word != words.end() && x && *x >= 0;
+        if (!good) break;
+        *word->second = *x;
+        words.erase(word);
     }
     if (!good)
         fail("check.tolerance",
@@ -64,16 +60,38 @@ struct Array {
     int back() const { return static_cast<int>(shape.back()); }
 };
 
-// Calls f with a value of the type that the tensor has in the file.
-template <class F>
-void with_type(DType dtype, F&& f) {
-    if (dtype == DType::F32) return f(float{});
-    if (dtype == DType::F64) return f(double{});
-    if (dtype == DType::U32) return f(uint32_t{});
-    if (dtype == DType::U64) return f(uint64_t{});
-    if (dtype == DType::I32) return f(int32_t{});
-    if (dtype == DType::I64) return f(int64_t{});
-    return f(uint8_t{});  // U8, BOOL
+// The entries of a tensor as long doubles, which hold every number of every type exactly.
+std::vector<long double> entries(const TensorFile& file, const StoredTensor& tensor) {
+    std::vector<long double> values(tensor.size / about(tensor.dtype).size);
+    const auto read = [&](auto x) {
+        for (size_t i = 0; i < values.size(); ++i) {
+            std::memcpy(&x, file.bytes(tensor).data() + i * sizeof x, sizeof x);
+            values[i] = static_cast<long double>(x);
+        }
+    };
+    switch (tensor.dtype) {
+        case DType::F32:
+            read(float{});
+            break;
+        case DType::F64:
+            read(double{});
+            break;
+        case DType::U32:
+            read(uint32_t{});
+            break;
+        case DType::U64:
+            read(uint64_t{});
+            break;
+        case DType::I32:
+            read(int32_t{});
+            break;
+        case DType::I64:
+            read(int64_t{});
+            break;
+        default:
+            read(uint8_t{});  // U8, BOOL
+    }
+    return values;
 }
 
 std::string shown(long double x) {
@@ -83,7 +101,7 @@ std::string shown(long double x) {
     return text;
 }
 
-// "[1, 2]" of an element.
+// The indices of an element as text, "[1, 2]".
 std::string place(const Shape& shape, size_t at) {
     std::string text;
     for (size_t axis = shape.size(); axis-- > 0; at /= shape[axis])
@@ -99,7 +117,7 @@ struct Case {
     bool verbose;
     Precision precision = Precision::float64;  // of what is computed now
     bool rounded = false;                      // an input was no float32
-    double worst = 0;                          // largest |got - expected| as a part of what is allowed
+    double worst = 0;                          // largest |wodtem - file| as a part of what is allowed
     std::set<std::string> used = {};           // tensors and metadata entries that were asked for
     std::vector<std::string> problems = {};    // what does not hold
 
@@ -149,23 +167,24 @@ struct Case {
              expected.c_str());
     }
 
-    // An input as it is computed with. What float cannot hold is rounded; where the code has two precisions the case is
-    // then computed in float alone, and where it has one the looser tolerance holds.
+    // An input in the type of the computation. What float cannot hold is rounded; where the code has two precisions the
+    // case is then computed in float alone, and where it has one the tolerance of float32 holds.
     template <class T>
     Array<T> in(const std::string& tensor_name, const Shape& pattern) {
         const StoredTensor& tensor = need("in/" + tensor_name);
         check_shape(tensor, pattern);
-        Array<T> array = {tensor.shape, std::vector<T>(tensor.size / about(tensor.dtype).size)};
-        with_type(tensor.dtype, [&](auto type) {
-            for (size_t i = 0; i < array.values.size(); ++i) {
-                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
-                array.values[i] = static_cast<T>(type);
-                if constexpr (std::is_same_v<T, float>)
-                    rounded |=
-                        static_cast<long double>(array.values[i]) != static_cast<long double>(type) && type == type;
-            }
-        });
+        Array<T> array = {tensor.shape, {}};
+        for (const long double x : entries(file, tensor)) {
+            const T value = array.values.emplace_back(static_cast<T>(x));
+            rounded |= std::is_same_v<T, float> && static_cast<long double>(value) != x && !std::isnan(x);
+        }
         return array;
+    }
+
+    [[noreturn]] void refuse_entry(const std::string& tensor_name, size_t at, const std::string& expected) {
+        const StoredTensor& tensor = need("in/" + tensor_name);
+        fail("check.value", "%s: entry %s is %s, expected %s", where(tensor).c_str(), place(tensor.shape, at).c_str(),
+             shown(entries(file, tensor)[at]).c_str(), expected.c_str());
     }
 
     template <class T>
@@ -173,33 +192,25 @@ struct Case {
         const Array<T> array = in<T>(tensor_name, pattern);
         for (size_t i = 0; i < array.values.size(); ++i)
             if (!(array.values[i] >= low && array.values[i] <= high))
-                fail("check.value", "%s: entry %s is %s, expected a number %s",
-                     where(need("in/" + tensor_name)).c_str(), place(array.shape, i).c_str(),
-                     shown(static_cast<long double>(array.values[i])).c_str(), range);
+                refuse_entry(tensor_name, i, std::string("a number ") + range);
         return array;
     }
-    // Numbers by which something is drawn.
+    // Random numbers in [0, 1).
     Array<double> uniform_in(const std::string& tensor_name, const Shape& pattern) {
         return in_range(tensor_name, pattern, 0.0, 1 - 0x1p-53, "from 0, below 1");
     }
 
     // Whole numbers from low to high.
     Array<int64_t> whole_in(const std::string& tensor_name, const Shape& pattern, int64_t low, int64_t high) {
-        const StoredTensor& tensor = need("in/" + tensor_name);
-        check_shape(tensor, pattern);
-        Array<int64_t> array = {tensor.shape, std::vector<int64_t>(tensor.size / about(tensor.dtype).size)};
-        with_type(tensor.dtype, [&](auto type) {
-            for (size_t i = 0; i < array.values.size(); ++i) {
-                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
-                const long double x = static_cast<long double>(type);
-                if (!(x >= static_cast<long double>(low) && x <= static_cast<long double>(high) && x == std::floor(x)))
-                    fail("check.value", "%s: entry %s is %s, expected a whole number from %lld to %lld",
-                         where(tensor).c_str(), place(tensor.shape, i).c_str(), shown(x).c_str(),
-                         static_cast<long long>(low), static_cast<long long>(high));
-                array.values[i] = static_cast<int64_t>(x);
-            }
-        });
-        return array;
+        const Array<long double> array = in<long double>(tensor_name, pattern);
+        Array<int64_t> whole = {array.shape, {}};
+        for (const long double x : array.values) {
+            if (!(x >= static_cast<long double>(low) && x <= static_cast<long double>(high) && x == std::floor(x)))
+                refuse_entry(tensor_name, whole.values.size(),
+                             "a whole number from " + std::to_string(low) + " to " + std::to_string(high));
+            whole.values.push_back(static_cast<int64_t>(x));
+        }
+        return whole;
     }
 
     // An input that may be left out.
@@ -277,52 +288,51 @@ struct Case {
         }
     }
 
-    // Holds `got` against CASE/out/NAME; of a list that is longer, the first entries. Whole numbers: exactly.
-    // `optional`: the file may leave it out. `slack`: by how much more than the tolerance each may be off.
-    // `most`: of a tolerance, where a wider one would not see what is at stake; 0: the slack is all but `absolute`.
+    // Compares `wodtem`, what this program computed, with CASE/out/NAME of the file; of a longer list its first entries.
+    // Whole numbers must be equal. `optional`: the file may leave it out. `slack`: by how much more than the tolerance
+    // each entry may be off. `most`: an upper bound on the tolerance, where a wider one would hide the mistake that the
+    // output is for; 0: the slack is all but `absolute`.
     template <class T>
-    void expect(const std::string& output, const Shape& shape, const std::vector<T>& got, bool optional = false,
+    void expect(const std::string& output, const Shape& shape, const std::vector<T>& wodtem, bool optional = false,
                 const std::vector<double>& slack = {}, double most = INFINITY) {
         if ((optional && !find("out/" + output)) || metadata_or("result", "ok") != "ok") return;
         const StoredTensor& tensor = need("out/" + output);
         check_shape(tensor, shape);
         const Tolerance allowed = tolerance(output);
         const bool exact = allowed.exact || std::is_integral_v<T>;
-        std::vector<long double> expected(got.size());
+        std::vector<long double> stored = entries(file, tensor);
+        stored.resize(wodtem.size());
         long double scale = 0;
-        with_type(tensor.dtype, [&](auto type) {
-            for (size_t i = 0; i < expected.size(); ++i) {
-                std::memcpy(&type, file.bytes(tensor).data() + i * sizeof type, sizeof type);
-                expected[i] = static_cast<long double>(type);
-                if (std::isfinite(expected[i])) scale = std::max(scale, std::fabs(expected[i]));
-            }
-        });
+        for (const long double x : stored)
+            if (std::isfinite(x)) scale = std::max(scale, std::fabs(x));
         const double relative = precision == Precision::float64 && !rounded ? allowed.float64 : allowed.float32;
         const long double bound =
             std::min(relative, most) * scale + std::min(allowed.absolute, most > 0 ? most : INFINITY);
         size_t failures = 0, first = 0;
         long double allowed_first = 0;
-        for (size_t i = 0; i < got.size(); ++i) {
-            const long double x = static_cast<long double>(got[i]), e = expected[i];
-            if (x == e || (std::isnan(x) && std::isnan(e))) continue;
-            // An expected value that is stored in float32 is itself rounded.
-            const long double here = exact || !std::isfinite(e)
-                                         ? 0
-                                         : bound + (slack.empty() ? 0 : slack[i]) +
-                                               (tensor.dtype == DType::F32 ? 0x1p-24L * std::fabs(e) : 0);
-            const long double off = std::fabs(x - e);
+        for (size_t i = 0; i < wodtem.size(); ++i) {
+            const long double ours = static_cast<long double>(wodtem[i]), theirs = stored[i];
+            if (ours == theirs || (std::isnan(ours) && std::isnan(theirs))) continue;
+            long double here = 0;
+            if (!exact && std::isfinite(theirs)) here = bound + (slack.empty() ? 0 : slack[i]);
+            // A number that is stored in float32 is itself rounded.
+            if (!exact && std::isfinite(theirs) && tensor.dtype == DType::F32) here += 0x1p-24L * std::fabs(theirs);
+            const long double off = std::fabs(ours - theirs);
             const double share = off <= here * 1e6L ? static_cast<double>(off / here) : INFINITY;  // NaN: infinity
             worst = std::max(worst, share);
-            if (!(share <= 1) && failures++ == 0) first = i, allowed_first = here;
+            if (share <= 1 || failures++ > 0) continue;
+            first = i;
+            allowed_first = here;
         }
         if (failures > 0)
-            problems.push_back("out/" + output + place(tensor.shape, first) + " in " + precision_name() + ": got " +
-                               shown(static_cast<long double>(got[first])) + ", expected " + shown(expected[first]) +
-                               (allowed_first > 0 ? " within " + shown(allowed_first) : ", exactly") +
-                               (failures > 1 ? "; so are " + std::to_string(failures - 1) + " more" : ""));
+            problems.push_back(
+                "out/" + output + place(tensor.shape, first) + " in " + precision_name() + ": file " +
+                shown(stored[first]) + ", wodtem " + shown(static_cast<long double>(wodtem[first])) +
+                (allowed_first > 0 ? ", allowed difference " + shown(allowed_first) : ", which must be equal") +
+                (failures > 1 ? "; " + std::to_string(failures - 1) + " more differ" : ""));
         if (verbose) {
-            print("expected " + output, tensor.shape, expected);
-            print(std::string("got ") + precision_name(), tensor.shape, got);
+            print("file " + output, tensor.shape, stored);
+            print(std::string("wodtem ") + precision_name(), tensor.shape, wodtem);
         }
     }
 
@@ -343,9 +353,9 @@ struct Case {
     }
 };
 
-// A computation with gradients: variables are inputs, `finish` holds the outputs against the file and, where it has
+// A computation with gradients: variables are inputs, `finish` compares the outputs with the file's and, where it has
 // in/upstream (the gradient of some loss with respect to the output; in/upstream/NAME where there are several outputs),
-// the gradient of every variable against out/gradient/NAME.
+// the gradient of every variable with out/gradient/NAME.
 template <class T>
 struct Graph {
     struct Variable {
@@ -485,7 +495,7 @@ void check_returns(Case& c) {
         d.insert(d.end(), trajectory.discounted_returns.begin(), trajectory.discounted_returns.end());
         at += static_cast<size_t>(length);
     }
-    for (const double x : g) scaled.push_back(static_cast<float>(x * scale));  // what the network is told
+    for (const double x : g) scaled.push_back(static_cast<float>(x * scale));  // the network's input
     c.expect("g", rewards.shape, g);
     c.expect("d", rewards.shape, d);
     c.precision = Precision::float32;
@@ -578,9 +588,8 @@ bool is_unused_parameter(const std::string& name) {
            name.ends_with(".attn.masked_bias");
 }
 
-// The network whose weights are in/parameter/NAME, under ODT's names; its sizes are theirs. Setting: heads.
-template <class T>
-std::unique_ptr<Transformer<T>> read_model(Case& c) {
+// The sizes of the network whose weights are in/parameter/NAME, under ODT's names. Setting: heads.
+TransformerConfig read_config(Case& c) {
     const std::set<std::string> names = c.named("in/parameter/");
     const auto shape = [&](const std::string& name) {
         const StoredTensor& tensor = c.need("in/parameter/" + name);
@@ -602,14 +611,56 @@ std::unique_ptr<Transformer<T>> read_model(Case& c) {
     config.head = names.contains("predict_action.logits.weight") ? Head::categorical
                   : names.contains("predict_action.0.weight")    ? Head::deterministic
                                                                  : Head::squashed_gaussian;
-    auto model = std::make_unique<Transformer<T>>(config, 0);
-    for (Parameter<T>& parameter : model->parameters) {
+    return config;
+}
+
+// Copies in/parameter/NAME into the network.
+template <class T>
+void read_parameters(Case& c, Transformer<T>& model) {
+    for (Parameter<T>& parameter : model.parameters) {
         const Array<T> array = c.in<T>("parameter/" + parameter.name, parameter.shape);
         std::copy(array.values.begin(), array.values.end(), parameter.value.begin());
     }
-    for (const std::string& name : names)
+    for (const std::string& name : c.named("in/parameter/"))
         if (is_unused_parameter(name)) c.find("in/parameter/" + name);
+}
+
+template <class T>
+std::unique_ptr<Transformer<T>> read_model(Case& c) {
+    auto model = std::make_unique<Transformer<T>>(read_config(c), 0);
+    read_parameters(c, *model);
     return model;
+}
+
+// Start values. Settings: seed, state_dim, action_dim, layers, width, head, positions, projected_dim. ->
+// parameter/NAME; projection [projected_dim, state_dim].
+void check_initialisation(Case& c) {
+    const auto size = [&](const char* name, std::optional<double> fallback, double most) {
+        return static_cast<int>(c.whole(name, fallback, fallback ? 0 : 1, most));
+    };
+    const uint32_t seed = static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF));
+    TransformerConfig config{};
+    config.state_dim = size("state_dim", {}, 1000);
+    config.action_dim = size("action_dim", {}, 1000);
+    config.layers = size("layers", {}, 10);
+    config.width = size("width", {}, 256);
+    config.heads = 1;  // no start value depends on it
+    config.max_timesteps = size("positions", 0, 1000);
+    const std::string head = c.word("head", "gaussian|categorical|deterministic");
+    config.head = head == "gaussian"      ? Head::squashed_gaussian
+                  : head == "categorical" ? Head::categorical
+                                          : Head::deterministic;
+    const Transformer<float> model(config, seed);
+    for (const Parameter<float>& parameter : model.parameters)
+        c.expect("parameter/" + parameter.name, parameter.shape, parameter.value);
+    MemoryConfig memory{};
+    memory.state_dim = config.state_dim;
+    memory.projected_dim = size("projected_dim", 0, 64);
+    memory.action_dim = memory.K = 1;
+    memory.capacity = 1;
+    memory.tau = 1;
+    c.expect("projection", {static_cast<uint64_t>(memory.projected_dim), static_cast<uint64_t>(config.state_dim)},
+             EpisodicMemory(memory, seed).projection, memory.projected_dim == 0);
 }
 
 // Windows: states [n, S], actions [n, A], returns_to_go [n], timesteps [n] and lengths [windows], packed; or [windows,
@@ -700,13 +751,17 @@ struct LayerOutputs {
     }
 };
 
-// Tokens as they enter the stack, R s a of each step but for the last action of a window, before embed_ln; and, where
-// the file has them, the outputs of all layers.
+// The tokens R, s, a of each step but for the last action of a window, before embed_ln; and, where the file has them,
+// the outputs of all layers. Settings: dropout, and what its masks are drawn from: seed, update, part (of the batch).
 template <class T>
 void check_tokens(Case& c) {
     const auto model = read_model<T>(c);
     const Windows windows = read_windows(c, model->config);
     Tape<T> tape(c.compute);
+    model->config.dropout = static_cast<float>(c.number("dropout", 0, 0, 0.99));
+    tape.dropout_random = {static_cast<uint32_t>(c.whole("seed", 0, 0, 0xFFFFFFFF)), Stream::dropout};
+    tape.dropout_step = static_cast<uint64_t>(c.whole("update", 0, 0, 0x1p53));
+    tape.part = static_cast<size_t>(c.whole("part", 0, 0, 4095));
     LayerOutputs<T> layers;
     layers.watch(tape);
     forward(tape, *model, windows.sequences, Queries::every_state);
@@ -716,6 +771,102 @@ void check_tokens(Case& c) {
         c.expect("layer/" + output.name, output.shape, output.value, true);
     }
     if (!held) c.need("out/layer/embed");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Topic: acting
+
+// An environment that shows given states, one after the other, and pays given rewards, whatever is done.
+struct Recording {
+    const Array<float>& states;    // [T, S]
+    const Array<double>& rewards;  // [T]
+    size_t t = 0;
+
+    Step step(const float*, float* state) {
+        const double reward = rewards.values[t];
+        const size_t S = states.shape[1], next = std::min(++t, rewards.values.size() - 1);
+        std::copy_n(&states.values[next * S], S, state);
+        return {reward, false};
+    }
+};
+
+// An episode of T steps under a policy: parameter/NAME, states [T, S], rewards [T], state_mean, state_deviation [S];
+// settings heads, act, target, reward_scale, eval_context, context_length, seed, episode. -> action [T, A] or [T],
+// returns_to_go [T + 1]; mean, log_std [T, A] or log_probabilities [T, moves]; noise [T, A] or uniform [T]; of the
+// windows, one after the other, window/lengths [T], timesteps, returns_to_go [n], states [n, S], actions [n - T, A].
+void check_acting(Case& c) {
+    const TransformerConfig config = read_config(c);
+    const bool discrete = config.head == Head::categorical;
+    const uint64_t S = static_cast<uint64_t>(config.state_dim), A = static_cast<uint64_t>(config.action_dim);
+    const Array<float> states = c.in<float>("states", {any, S});
+    const uint64_t T = states.shape[0];
+    const Array<double> rewards = c.in<double>("rewards", {T});
+    const bool samples = c.word("act", "most_likely|sample") == "sample";
+    Settings settings;
+    settings.reward_scale = c.number("reward_scale", 1, 1e-9, 1e9);
+    settings.eval_context = c.whole("eval_context", {}, 1, 1000);
+    settings.context_length = c.whole("context_length", {}, 1, 1000);
+    const double target = c.number("target", {}, -1e9, 1e9);
+    const uint64_t number = samples ? static_cast<uint64_t>(c.whole("episode", 0, 0, 0x1p53)) : 0;
+    const Random random{samples ? static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF)) : 0, Stream::exploration};
+    if (T < 1 || T > 10000)
+        fail("check.value", "%s: case %s: an episode of %llu steps, expected 1 to 10000", c.file.path.c_str(),
+             c.name.c_str(), static_cast<unsigned long long>(T));
+    EnvironmentSpec spec{};
+    spec.state_dim = config.state_dim;
+    spec.action_dim = discrete ? 1 : config.action_dim;
+    spec.moves = discrete ? config.action_dim : 0;
+    Agent agent{settings,
+                spec,
+                Transformer<float>(config, 0),
+                {c.in<float>("state_mean", {S}).values, c.in<float>("state_deviation", {S}).values}};
+    read_parameters(c, agent.model);
+
+    Recording environment{states, rewards};
+    std::vector<Episode> episodes(1);
+    Episode& episode = episodes[0];
+    episode.state.assign(states.values.begin(), states.values.begin() + static_cast<ptrdiff_t>(S));
+    episode.returns_to_go = {static_cast<float>(target * settings.reward_scale)};
+    Tape<float> tape(c.compute);
+    tape.recording = false;
+    std::vector<int> lengths, timesteps;
+    std::vector<float> window_returns, window_states, window_actions, policies, log_std, noise;
+    std::vector<double> uniform;
+    const auto append = [](auto& to, const auto* from, size_t n) { to.insert(to.end(), from, from + n); };
+    for (uint32_t t = 0; t < T; ++t) {
+        const SequenceBatch window = acting_batch(agent, episodes);
+        const size_t n = window.timesteps.size();
+        append(lengths, window.lengths.data(), 1);
+        append(timesteps, window.timesteps.data(), n);
+        append(window_returns, window.returns_to_go.data(), n);
+        append(window_states, window.states.data(), n * S);
+        append(window_actions, window.actions.data(), (n - 1) * A);
+        tape.reset();
+        const Policy<float> policy = forward(tape, agent.model, window, Queries::last_state);
+        append(policies, policy.output.value, A);
+        if (config.head == Head::squashed_gaussian) append(log_std, policy.log_std.value, A);
+        for (uint32_t i = 0; i < A; ++i) noise.push_back(random.normal(number, t, i));
+        uniform.push_back(random.uniform(number, t));
+        const std::vector<float> action =
+            choose_action(agent, policy, 0, samples ? Act::sample : Act::most_likely, random, number, t);
+        step_episode(episode, environment, action, settings.reward_scale);
+    }
+    const uint64_t n = timesteps.size();
+    c.expect("window/lengths", {T}, lengths, true);
+    c.expect("window/timesteps", {n}, timesteps, true);
+    c.expect("window/returns_to_go", {n}, window_returns, true);
+    c.expect("window/states", {n, S}, window_states, true);
+    c.expect("window/actions", {n - T, A}, window_actions, true);
+    c.expect("returns_to_go", {T + 1}, episode.returns_to_go, true);
+    c.expect(discrete ? "log_probabilities" : "mean", {T, A}, policies, true);
+    if (config.head == Head::squashed_gaussian) c.expect("log_std", {T, A}, log_std, true);
+    if (samples && discrete) c.expect("uniform", {T}, uniform, true);
+    if (samples && config.head == Head::squashed_gaussian) c.expect("noise", {T, A}, noise, true);
+    const std::vector<float>& actions = episode.trajectory.actions;
+    if (discrete)
+        c.expect("action", {T}, std::vector<int>(actions.begin(), actions.end()));
+    else
+        c.expect("action", {T, A}, actions);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1602,12 +1753,14 @@ struct Topic {
 };
 constexpr Topic topics[] = {
     {"rng", nullptr, check_rng},
+    {"initialisation", nullptr, check_initialisation},
     {"returns", check_returns, nullptr},
     {"linear", check_linear<double>, check_linear<float>},
     {"layernorm", check_layernorm<double>, check_layernorm<float>},
     {"mlp", check_mlp<double>, check_mlp<float>},
     {"attention", check_attention<double>, check_attention<float>},
     {"tokens", check_tokens<double>, check_tokens<float>},
+    {"acting", nullptr, check_acting},
     {"policy_gaussian", check_policy_gaussian<double>, check_policy_gaussian<float>},
     {"policy_discrete", check_policy_discrete<double>, check_policy_discrete<float>},
     {"policy_deterministic", check_policy_deterministic<double>, check_policy_deterministic<float>},
@@ -1672,13 +1825,11 @@ std::string first_not_finite(const Case& c) {
     for (const std::string& name : c.named("in/")) {
         if (name == "memory/distance") continue;  // infinite where there is no neighbour
         const StoredTensor& tensor = c.file.find(c.name + "/in/" + name);
-        with_type(tensor.dtype, [&](auto type) {
-            for (size_t i = 0; text.empty() && i < tensor.size / sizeof type; ++i) {
-                std::memcpy(&type, c.file.bytes(tensor).data() + i * sizeof type, sizeof type);
-                const long double x = static_cast<long double>(type);
-                if (!std::isfinite(x)) text = c.where(tensor) + ": entry " + place(tensor.shape, i) + " is " + shown(x);
-            }
-        });
+        const std::vector<long double> values = entries(c.file, tensor);
+        const auto bad = std::find_if_not(values.begin(), values.end(), [](long double x) { return std::isfinite(x); });
+        if (!text.empty() || bad == values.end()) continue;
+        text = c.where(tensor) + ": entry " + place(tensor.shape, static_cast<size_t>(bad - values.begin())) + " is " +
+               shown(*bad);
     }
     return text;
 }
@@ -1693,11 +1844,7 @@ void print_inputs(const Case& c) {
             std::printf("    %s = %s\n", printable(key.substr(c.name.size() + 1)).c_str(), printable(text).c_str());
     for (const StoredTensor& tensor : c.file.tensors)
         if (tensor.name.starts_with(c.name + "/in/"))
-            with_type(tensor.dtype, [&](auto type) {
-                std::vector<decltype(type)> values(tensor.size / sizeof type);
-                if (tensor.size > 0) std::memcpy(values.data(), c.file.bytes(tensor).data(), tensor.size);
-                Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, values);
-            });
+            Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, entries(c.file, tensor));
 }
 
 // A case is computed by every function that its topic has; what none of them asked for is an error.
@@ -1751,7 +1898,7 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
              json_string(name.substr(0, 80)).c_str());
     double worst = 0;
     std::vector<Case> failed;
-    std::optional<Error> malformed;  // the first; more are told like what does not hold
+    std::optional<Error> malformed;  // the first; more are printed like what does not hold
     bool rounded = false;
     size_t bad = 0;  // malformed, and nothing else is wrong
     const std::vector<std::string> cases = cases_of(file);
@@ -1761,13 +1908,13 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
         const std::string expected = expected_error(c);
         try {
             check_case(c, *topic);
-            if (!expected.empty()) c.problems.push_back("expected the error " + expected + ", none came");
+            if (!expected.empty()) c.problems.push_back("file: the error " + expected + "; wodtem: no error");
         } catch (const Error& error) {
             if (error.id == expected) continue;
             std::string text = error.what();
             if (error.id.ends_with("not_finite"))
                 if (const std::string input = first_not_finite(c); !input.empty()) text = input + ": " + text;
-            if (!expected.empty()) text = "expected the error " + expected + ", got " + error.id + ": " + text;
+            if (!expected.empty()) text = "file: the error " + expected + "; wodtem: " + error.id + ": " + text;
             if (!text.starts_with(path)) text = path + ": case " + json_string(case_name) + ": " + text;
             if (malformed) c.problems.push_back(text);
             if (!malformed) malformed.emplace(error.id, text);
@@ -1779,6 +1926,8 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
     }
     std::printf("%-44s %3zu cases, %zu failed, worst error %.2g of what is allowed%s\n", path.c_str(), cases.size(),
                 failed.size() + bad, worst, rounded ? " (inputs rounded to float32)" : "");
+    if (!failed.empty())
+        std::printf("  file: the number in the file; wodtem: what this program computes. Begin with the first case.\n");
     for (const Case& c : std::span(failed).first(std::min<size_t>(failed.size(), 20))) {
         std::printf("  case %s does not hold: %s\n", c.name.c_str(), entry(c, "note").c_str());
         for (size_t i = 0; i < std::min<size_t>(c.problems.size(), 10); ++i)

@@ -111,6 +111,31 @@ def philox(counter, key):
     return c
 
 
+class Draw:
+    """What is drawn by (seed, stream) of (step, index, site)."""
+
+    def __init__(self, seed, stream):
+        self.key = [seed, stream]
+
+    def words(self, step, index, site=0):
+        return philox([index, site, step & 0xFFFFFFFF, step >> 32], self.key)
+
+    def uniform(self, step, index, site=0):
+        w = self.words(step, index, site)
+        return ((w[1] << 32 | w[0]) >> 11) / 2.0**53
+
+    def normal(self, step, index, site=0):
+        w = self.words(step, index, site)
+        return math.sqrt(-2 * math.log(((w[2] >> 8) + 1) / 2.0**24)) * math.cos((w[3] >> 8) / 2.0**24 * 2 * math.pi)
+
+    def dropout(self, probability, step, site, element):
+        word = self.words(step, element // 4, site)[element % 4]
+        return 0.0 if word < int(probability * 2**32) else 1 / (1 - probability)
+
+
+NORMAL = 8 * 2 * math.pi * U  # of Draw.normal in float32: the angle, up to 2 pi, is rounded three times
+
+
 def rng():
     f = File("rng", "none: the source of all chance")
     ones = 0xFFFFFFFF
@@ -415,13 +440,49 @@ def painted_parameters(shapes, scale=0.25):
     return {name: torch.tensor(value, requires_grad=True) for name, value in p.items()}
 
 
-def network(p, windows, heads):
+class Mask:
+    """Dropout's factors, which count the elements of the packed computation: its rows are all tokens but each window's
+    last action, in the last layer the state tokens alone. A row that it does not have is masked by 1."""
+
+    def __init__(self, lengths, layers, heads, probability, update, seed, part=0):
+        self.lengths, self.layers, self.heads = lengths, layers, heads
+        self.probability, self.update, self.part = probability, update, part
+        self.draw = Draw(seed, 2)
+
+    def rows(self, window, site):
+        """(token, row) of those that are computed."""
+        C, before = self.lengths[window], self.lengths[:window]
+        if site > 3 * (self.layers - 1):
+            return [(3 * c + 1, sum(before) + c) for c in range(C)]
+        return [(i, sum(3 * n - 1 for n in before) + i) for i in range(3 * C - 1)]
+
+    def factor(self, site, element):
+        return self.draw.dropout(self.probability, self.update, site + (self.part << 20), element)
+
+    def of_tokens(self, window, site, d):
+        mask = np.ones((3 * self.lengths[window], d))
+        for token, row in self.rows(window, site):
+            mask[token] = [self.factor(site, row * d + j) for j in range(d)]
+        return torch.tensor(mask)
+
+    def of_weights(self, window, site):
+        tokens, longest = 3 * self.lengths[window], 3 * max(self.lengths) - 1
+        mask = np.ones((self.heads, tokens, tokens))
+        for token, row in self.rows(window, site):
+            for h in range(self.heads):
+                mask[h, token, :token + 1] = [
+                    self.factor(site, (row * self.heads + h) * longest + key) for key in range(token + 1)]
+        return torch.tensor(mask)
+
+
+def network(p, windows, heads, mask=None):
     """windows: (R [C], s [C, S], a [C, A], t [C]) each. Returns the outputs of all layers as a list of windows, and
     which of their rows a packed computation has: all tokens but the last action, or the state tokens alone."""
     layers = [name.split(".")[2] for name in p if name.endswith("attn.c_attn.weight")]
     outputs, every, asking = {}, [], []
-    for R, s, a, t in windows:
+    for window, (R, s, a, t) in enumerate(windows):
         C, d = len(R), p["embed_ln.weight"].shape[0]
+        drop = lambda site, x: x if mask is None else x * mask.of_tokens(window, site, d)
         time = 0
         if "embed_ordering.weight" in p:
             table = p["embed_ordering.weight"]
@@ -432,22 +493,24 @@ def network(p, windows, heads):
         x = torch.stack(e, 1).reshape(3 * C, d)
         put = lambda name, x: outputs.setdefault(name, []).append(x) or x
         put("embed", x)
-        x = put("embed_ln", layer_norm(x, p["embed_ln.weight"], p["embed_ln.bias"]))
-        mask = torch.full((3 * C, 3 * C), -math.inf).triu(1)
+        x = put("embed_ln", drop(0, layer_norm(x, p["embed_ln.weight"], p["embed_ln.bias"])))
+        unseen = torch.full((3 * C, 3 * C), -math.inf).triu(1)
         for layer in layers:
-            h = f"transformer.h.{layer}"
+            h, site = f"transformer.h.{layer}", 1 + 3 * int(layer)
             g = lambda name: (p[f"{h}.{name}.weight"], p[f"{h}.{name}.bias"])
             w, b = g("attn.c_attn")
             q, k, v = (layer_norm(x, *g("ln_1")) @ w + b).split(d, 1)
             cut = lambda z: z.reshape(3 * C, heads, d // heads).transpose(0, 1)
-            weights = torch.softmax(cut(q) @ cut(k).transpose(1, 2) / math.sqrt(d // heads) + mask, -1)
+            weights = torch.softmax(cut(q) @ cut(k).transpose(1, 2) / math.sqrt(d // heads) + unseen, -1)
+            if mask is not None:
+                weights = weights * mask.of_weights(window, site)
             y = (weights @ cut(v)).transpose(0, 1).reshape(3 * C, d)
             w, b = g("attn.c_proj")
-            x = put(h + ".attn", x + y @ w + b)
+            x = put(h + ".attn", x + drop(site + 1, y @ w + b))
             w, b = g("mlp.c_fc")
             hidden = torch.relu(layer_norm(x, *g("ln_2")) @ w + b)
             w, b = g("mlp.c_proj")
-            x = put(h, x + hidden @ w + b)
+            x = put(h, x + drop(site + 2, hidden @ w + b))
         x = put("transformer.ln_f", layer_norm(x, p["transformer.ln_f.weight"], p["transformer.ln_f.bias"]))
         states = x[1::3]  # the action is read from the state's token
         head = lambda name: states @ p[f"predict_action.{name}.weight"].T + p[f"predict_action.{name}.bias"]
@@ -476,6 +539,56 @@ def split_windows(lengths, *arrays):
             for n, e in zip(lengths, ends)]
 
 
+def initialisation():
+    f = File("initialisation", "none: ODT's start values, from the seed")
+
+    def case(name, note, seed, state_dim, action_dim, layers, d, head, positions=0, projected_dim=0):
+        draw, p = Draw(seed, 1), {}
+        for number, (key, shape) in enumerate(parameter_shapes(state_dim, action_dim, layers, d, head,
+                                                               positions).items()):
+            kind, n = key.rsplit(".", 1)[1], int(np.prod(shape))
+            normal = lambda: np.array([draw.normal(number, i) for i in range(n)]).reshape(shape)
+            orthogonal = "predict_action" in key and head != "deterministic"
+            if "ln_" in key or "embed_ln" in key:
+                p[key] = np.full(shape, 1.0 if kind == "weight" else 0.0)
+            elif key == "embed_ordering.weight":
+                p[key] = normal()
+            elif key.startswith("transformer."):
+                p[key] = 0.02 * normal() if kind == "weight" else np.zeros(shape)
+            elif orthogonal:
+                p[key] = np.zeros(shape)
+                for i, row in enumerate(normal() if kind == "weight" else ()):
+                    for other in p[key][:i]:
+                        row = row - (row @ other) * other
+                    p[key][i] = row / np.sqrt(row @ row)
+            else:
+                fan_in = {"embed_return": 1, "embed_state": state_dim, "embed_action": action_dim}.get(
+                    key.split(".")[0], d)
+                p[key] = np.array([(2 * draw.uniform(number, i) - 1) / math.sqrt(fan_in) for i in range(n)
+                                  ]).reshape(shape)
+        outputs = {"parameter/" + key: value for key, value in p.items()}
+        settings = {"seed": seed, "state_dim": state_dim, "action_dim": action_dim, "layers": layers, "width": d,
+                    "head": head, "positions": positions}
+        if projected_dim:
+            outputs["projection"] = np.array([
+                Draw(seed, 8).normal(0, i) / math.sqrt(projected_dim) for i in range(projected_dim * state_dim)
+            ]).reshape(projected_dim, state_dim)
+            settings["projected_dim"] = projected_dim
+        f.case(name, note, f"float32 {NORMAL:.2g}: normals as in rng, uniform numbers are rounded once",
+               NUMPY + ", Python's whole numbers", {}, outputs, **settings)
+        for key in p:
+            if "predict_action" in key and key.endswith("weight") and head != "deterministic":
+                f.tolerance(name, "parameter/" + key, f"float32 {8 * NORMAL:.2g}: differences of rows of normals")
+
+    case("gaussian", "which distribution for which tensor; a tensor's number is its place in this order, the biases "
+         "count; orthonormal heads, by Gram and Schmidt; the memory's projection has variance 1 / F1",
+         7, 3, 2, 2, 8, "gaussian", projected_dim=4)
+    case("categorical", "positions come last, so that they move no other tensor's numbers", 4294967295, 2, 5, 1, 6,
+         "categorical", 3)
+    case("deterministic", "DT's head is an ordinary Linear: uniform, not orthonormal", 0, 3, 2, 1, 4, "deterministic")
+    f.save()
+
+
 def tokens():
     f = File("tokens", "WODTEM sec. III-A: s_{-C,t}, g_{-C,t}; DT sec. 3: the order R, s, a")
 
@@ -490,7 +603,8 @@ def tokens():
              state_dim=3,
              action_dim=2,
              d=4,
-             layers=1):
+             layers=1,
+             dropout=None):
         n = sum(lengths)
         p = painted_parameters(parameter_shapes(state_dim, action_dim, layers, d, head, positions))
         R, s, a = paint(11, n), paint(1, n, state_dim), paint(50, n, action_dim)
@@ -507,7 +621,10 @@ def tokens():
         inputs.update({"returns_to_go": R, "states": s, "lengths": np.array(lengths)})
         if timesteps is not None:
             inputs["timesteps"] = t
-        outputs, rows = network(p, split_windows(lengths, R, s, a, t), 2)
+        settings = {} if dropout is None else dict(dropout, dropout=repr(float(np.float32(dropout["dropout"]))))
+        mask = None if dropout is None else Mask(lengths, layers, 2, float(settings["dropout"]), dropout["update"],
+                                                 dropout["seed"], dropout["part"])
+        outputs, rows = network(p, split_windows(lengths, R, s, a, t), 2, mask)
         results = {"layer/" + name: packed(outputs[name], rows[name]) for name in held}
         k = 8 * (max(state_dim, action_dim) + d + 8) * (1 + 8 * layers * (len(held) > 2))
         f.case(name,
@@ -516,7 +633,8 @@ def tokens():
                TORCH,
                inputs,
                results,
-               heads=2)
+               heads=2,
+               **settings)
 
     case("order", "the order R, s, a; another layer's weight for a token; the last action of a window is no token",
          [3])
@@ -533,6 +651,114 @@ def tokens():
          "categorical", 2, 4)
     case("deterministic", "DT's head: tanh of predict_action.0, positions in use", [2, 2], 5, None, None,
          ("embed", "policy.mean"), "deterministic")
+    case("dropout", "dropout's places and how elements are counted: after embed_ln, then in each layer the attention's "
+         "weights, its projection, the MLP; not before embed_ln, not after ln_f", [2, 1, 3], 0, None, None,
+         ("embed", "embed_ln", "transformer.h.0.attn", "transformer.h.0", "transformer.h.1.attn", "transformer.h.1",
+          "transformer.ln_f", "policy.mean", "policy.log_std"), layers=2,
+         dropout={"dropout": 0.25, "seed": 11, "update": 2**32 + 3, "part": 5})
+    f.save()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# acting: an episode step by step, each window through the network by itself.
+
+
+def acting():
+    f = File("acting", "WODTEM sec. III-B: acting, its return-to-go and its sliding context")
+
+    def case(name, note, head, act, T, eval_context, context_length, state_dim=3, action_dim=2, layers=1, d=8,
+             positions=0, target=3.0, scale=0.5, seed=5, episode=0, bias=None):
+        p = painted_parameters(parameter_shapes(state_dim, action_dim, layers, d, head, positions))
+        if bias is not None:
+            p["predict_action.mu.bias"] = torch.tensor(bias)
+        states, rewards = paint(1, T, state_dim, scale=4.0), paint(11, T, scale=2.0)
+        mean, deviation = paint(40, state_dim), 2.0**(np.arange(state_dim) - 1)
+        chance, context = Draw(seed, 4), min(eval_context, context_length)
+        told, taken, tokens = [np.float64(target * scale)], [], np.zeros((T, action_dim))
+        window = {"lengths": [], "timesteps": [], "returns_to_go": [], "states": [], "actions": []}
+        policies, drawn = [], []
+        normalised = (states - mean) / deviation
+        for t in range(T):
+            first = max(0, t + 1 - context)
+            steps = np.arange(first, t + 1)
+            window["lengths"].append(len(steps))
+            window["timesteps"] += list(steps)
+            window["returns_to_go"] += [told[i] for i in steps]
+            window["states"] += list(normalised[steps])
+            window["actions"] += list(tokens[steps[:-1]])
+            batch = (torch.tensor(np.array(told)[steps]), torch.tensor(normalised[steps]), torch.tensor(tokens[steps]),
+                     steps)
+            outputs, _ = network(p, [batch], 2)
+            last = lambda name: outputs[name][0][-1].detach().numpy()
+            policies.append([last(x) for x in ("policy.mean", "policy.log_std") if x in outputs])
+            if head == "categorical":
+                probability = np.exp(last("policy.mean"))
+                if act == "most_likely":
+                    move = int(np.argmax(probability))
+                    assert np.sort(probability)[-1] - np.sort(probability)[-2] > 1e-3
+                else:
+                    drawn.append(chance.uniform(episode, t))
+                    ends = np.cumsum(probability)
+                    move = int(np.searchsorted(ends, drawn[-1], side="right"))
+                    assert abs(ends[:-1] - drawn[-1]).min() > 1e-3
+                taken.append(move)
+                tokens[t, move] = 1
+            else:
+                u = last("policy.mean")
+                if head == "gaussian" and act == "sample":
+                    drawn.append([chance.normal(episode, t, i) for i in range(action_dim)])
+                    u = u + np.exp(last("policy.log_std")) * drawn[-1]
+                a = np.tanh(u) if head == "gaussian" else u  # DT's is squashed by the network
+                taken.append(np.clip(a, -1 + 1e-6, 1 - 1e-6))
+                tokens[t] = taken[-1]
+            told.append(told[-1] - rewards[t] * scale)
+        chain = 2 + state_dim + layers * (2 * (d + 8) + 4 * d + d // 2 + 3 * context) + d
+        k = 2 * math.ceil(8 * math.sqrt(chain))
+        inputs = {"parameter/" + key: v for key, v in p.items()}
+        inputs.update({"states": states, "rewards": rewards, "state_mean": mean, "state_deviation": deviation})
+        outputs = {"window/" + key: np.array(v, dtype=np.int64 if key in ("lengths", "timesteps") else np.float64)
+                   for key, v in window.items()}
+        outputs["window/actions"] = outputs["window/actions"].reshape(-1, action_dim)
+        outputs["returns_to_go"] = np.array(told)
+        for i, key in enumerate(["log_probabilities"] if head == "categorical" else ["mean", "log_std"]):
+            if i < len(policies[0]) and head != "deterministic":
+                outputs[key] = np.array([policy[i] for policy in policies])
+        if drawn:
+            outputs["uniform" if head == "categorical" else "noise"] = np.array(drawn)
+        outputs["action"] = np.array(taken)
+        settings = {"heads": 2, "act": act, "target": target, "reward_scale": scale, "eval_context": eval_context,
+                    "context_length": context_length}
+        if act == "sample":
+            settings.update(seed=seed, episode=episode)
+        f.case(name, note, f"float32 {k * U:.2g}: 16 roots of {chain} roundings, as earlier actions are off too",
+               TORCH, inputs, outputs, **settings)
+        f.tolerance(name, "returns_to_go", "exact: halves of 128ths")
+        f.tolerance(name, "window/returns_to_go", "exact: halves of 128ths")
+        if act == "sample":
+            f.tolerance(name, list(outputs)[-2], f"float32 {NORMAL:.2g}: as in rng")
+        if bias is not None:
+            f.tolerance(name, "action", f"float32 {U:.2g}: the clamp's two ends")
+
+    case("gaussian_most_likely",
+         "the window slides: the latest eval_context steps, the present one last; time-steps count from the episode's "
+         "first and are clipped at the table's end; tanh(mean), no noise", "gaussian", "most_likely", 8, 3, 4,
+         layers=2, positions=6)
+    case("gaussian_sampled",
+         "never more than context_length steps; R_1 is target times scale, and falls by reward times scale; stream 4: "
+         "step is the episode, index the time-step, site the dimension", "gaussian", "sample", 6, 5, 2,
+         target=-1.5, scale=0.25, episode=2**40 + 3)
+    case("first_action", "the first action sees R_1 and s_1 alone, whatever eval_context", "gaussian", "sample", 1, 20,
+         20)
+    case("whole_context", "an episode shorter than the context: nothing is padded", "gaussian", "most_likely", 4, 20,
+         20)
+    case("clamped", "actions are clamped to +-(1 - 1e-6) before they are taken, and so before they are tokens",
+         "gaussian", "most_likely", 3, 3, 3, bias=[30.0, -30.0])
+    case("categorical_most_likely", "moves enter as one-hot tokens", "categorical", "most_likely", 7, 3, 20,
+         state_dim=2, action_dim=4)
+    case("categorical_sampled", "the move whose share of [0, 1) contains the number: one number a step, of site 0",
+         "categorical", "sample", 7, 2, 20, state_dim=2, action_dim=4, episode=9)
+    case("deterministic", "DT: the network's own tanh, clamped; nothing is drawn", "deterministic", "most_likely", 5, 2,
+         4, positions=4)
     f.save()
 
 
@@ -866,6 +1092,17 @@ def memory_lookup():
          K=3)
     case("ties_cut", "tie at the K-th place: the older entry stays", [[0.0, 0.5], b, [-0.5, 0.0], [0.0, -0.5]],
          [1.0, 2.0, 3.0, 4.0], [a], K=2)
+    # All signs and orders of four numbers lie equally far from 0. Of 72 states, shuffled, 18 are near and 54 far. The
+    # first 40 fill the table; some are met again; then the others take the places of those that were not.
+    sign = lambda i: [1 - 2 * (i >> j & 1) for j in range(4)]
+    orders = lambda values, n: [list(np.roll(values, i % 4) * sign(i // 4)) for i in range(n)]
+    states = orders([0.5, 0.25, 0.125, 0.375], 18) + orders([1.0, 0.5, 0.25, 0.75], 54)
+    states = [states[i * 31 % 72] for i in range(72)]
+    assert len({tuple(s) for s in states}) == 72
+    rows = states[:40] + [states[i] for i in range(0, 40, 3)] + states[40:]
+    case("ties_many", "an unstable sort: of up to 54 equal distances the older entries come first, whatever their "
+         "places in the table", rows, paint(61, len(rows), scale=4.0), [[0.0] * 4, [0.0, 0.0, 0.0, 2.0]], K=20,
+         capacity=40)
     case("exact_hit",
          "an exact hit is a neighbour at distance 0 beside others, not the answer alone",
          grid,
@@ -1202,6 +1439,18 @@ def optimizer():
          **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
     case("norm_far_above_clip", "a norm of a hundred times the clip", q, three(100.0),
          **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
+    case("clip_leaves_small_gradients", "a clip that scales small gradients up to the clip: norms of 0.02, 0.07 and 0.005 "
+         "stay apart, and so do the steps", p,
+         {k: v[:3] * 2.0**np.array([-7, -5, -9]).reshape(3, *[1] * (v.ndim - 1)) for k, v in g.items()},
+         **dict(common, clip_norm=0.25))
+    large = {"norm_8": (4, 3), "norm_90_small_steps": (12, 8), "norm_90_large_steps": (12, 8)}
+    sizes = {"norm_8": (4.0, 2.0**-6), "norm_90_small_steps": (16.0, 2.0**-12),
+             "norm_90_large_steps": (16.0, 64.0)}
+    case("large_norms", "the trust ratio has no bound: a norm above 10 counts whole, so does a ratio above 10, and "
+         "nothing is added to the step's norm, however small", {k: paint(7, *s, scale=sizes[k][0])
+                                                                for k, s in large.items()},
+         {k: paint(100 + 31 * i, 3, *s, scale=sizes[k][1]) for i, (k, s) in enumerate(large.items())},
+         learning_rate=0.0625, weight_decay=2.0**-14, clip_norm=0, optimizer_epsilon=1)
     case("zero_gradient", "a gradient of zero: the moments decay, the decay of weights goes on", p,
          {k: np.concatenate([v[:1], 0 * v[:2]]) for k, v in g.items()}, **common)
     case("zero_throughout", "never a gradient: 0 / (0 + epsilon)", p, {k: 0 * v[:2] for k, v in g.items()}, **common)
@@ -1812,7 +2061,7 @@ def maze2d(e, f, case):
     f.save()
 
 
-TOPICS = [rng, returns, linear, layernorm, mlp, attention, tokens, policy_gaussian, policy_discrete,
+TOPICS = [rng, initialisation, returns, linear, layernorm, mlp, attention, tokens, acting, policy_gaussian, policy_discrete,
           policy_deterministic, memory_update, memory_lookup, memory_action, weights, objective, optimizer, sampling,
           normalize, gridworld, step, environments]
 
