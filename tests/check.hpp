@@ -1159,19 +1159,18 @@ double half_ulp(double x) {
     return (static_cast<double>(std::nextafter(y, INFINITY)) - static_cast<double>(y)) / 2;
 }
 
-// What updates in float32 may do to parameters, element by element, and where they go where nothing is rounded.
+// How far parameters after updates in float32 may be off, element by element. Its three parts are described in
+// tests/vectors/README.md, "How outputs are compared".
 struct Slack {
     std::vector<double> off;                    // [parameters] of the clipped gradients of all updates so far
     std::vector<double> moved;                  // [parameters] the largest step of an update, summed over updates
     std::vector<std::vector<double>> rounding;  // [parameters][size]
-    std::vector<std::vector<double>> exact;     // [parameters][size] not rounded to float32 after an update
 
     // inexact: the first values were no float32 in the file.
     Slack(const std::vector<Parameter<float>>& parameters, bool inexact)
         : off(parameters.size()),
           moved(parameters.size()) {
         for (const Parameter<float>& parameter : parameters) {
-            exact.emplace_back(parameter.value.begin(), parameter.value.end());
             rounding.emplace_back(parameter.value.size());
             for (size_t i = 0; inexact && i < parameter.value.size(); ++i)
                 rounding.back()[i] = half_ulp(parameter.value[i]);
@@ -1188,9 +1187,9 @@ struct Slack {
         const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
         const double bias1 = 1 - power(config.beta1, optimizer.updates),
                      bias2 = 1 - power(config.beta2, optimizer.updates);
-        for (size_t p = 0; p < exact.size(); ++p) {
+        for (size_t p = 0; p < rounding.size(); ++p) {
             off[p] = std::max(off[p], clip * gradient_off[p]);
-            const size_t n = exact[p].size();
+            const size_t n = rounding[p].size();
             std::vector<double> u(n), du(n);
             double squares_of_value = 0, squares_of_u = 0, squares_of_du = 0;
             for (size_t i = 0; i < n; ++i) {
@@ -1213,7 +1212,6 @@ struct Slack {
             double largest = 0;
             for (size_t i = 0; i < n; ++i) {
                 const double from = before[p][i], step = decay * from + rate * u[i];
-                exact[p][i] -= step;
                 largest = std::max(largest, std::fabs(step));
                 rounding[p][i] += rate * (du[i] + ratio * std::fabs(u[i])) +
                                   roundings * half_ulp(std::max(std::fabs(from), std::fabs(from - step)));
@@ -1555,19 +1553,13 @@ void check_advice(Case& c) {
     c.expect("memory/a_hat", {n, memory.A}, a_hat);
 }
 
-// What may be wrong with each gradient: float32's rounding, a part of its largest entry, or that of the parameters, but
-// no more than 16 times the former: further apart the two networks say nothing of steps.
-std::vector<double> gradient_off(const std::vector<Parameter<float>>& parameters, double relative,
-                                 const Transformer<double>* unrounded) {
+// How far float32 may put each gradient off: a part of the tensor's largest entry.
+std::vector<double> gradient_off(const std::vector<Parameter<float>>& parameters, double relative) {
     std::vector<double> off;
-    for (size_t p = 0; p < parameters.size(); ++p) {
-        double largest = 0, apart = 0;
-        for (size_t i = 0; i < parameters[p].gradient.size(); ++i) {
-            const double g = parameters[p].gradient[i];
-            largest = std::max(largest, std::fabs(g));
-            if (unrounded) apart = std::max(apart, std::fabs(g - unrounded->parameters[p].gradient[i]));
-        }
-        off.push_back(std::clamp(apart, relative * largest, 16 * relative * largest));
+    for (const Parameter<float>& parameter : parameters) {
+        double largest = 0;
+        for (const float g : parameter.gradient) largest = std::max(largest, std::fabs(static_cast<double>(g)));
+        off.push_back(relative * largest);
     }
     return off;
 }
@@ -1612,15 +1604,9 @@ void check_step(Case& c) {
     read_moments(c, lambda.temperature.log_lambda, lambda.temperature.optimizer);
     check_advice(c);
     Tape<T> tape(c.compute);
-    Tape<double> unrounded_tape(c.compute);
-    std::unique_ptr<Transformer<double>> unrounded;  // `model` had its parameters not been rounded after each update
     std::optional<Slack> slack;
     if constexpr (std::is_same_v<T, float>) slack.emplace(model->parameters, c.rounded);
-    struct List {
-        std::vector<double> got = {}, slack = {};
-        void add(double x, double other) { got.push_back(x), slack.push_back(std::fabs(x - other)); }
-    };
-    std::map<std::string, List> lists;
+    std::map<std::string, std::vector<double>> lists;  // of every update
     for (int update = 1; update <= updates; ++update) {
         tape.reset();
         LayerOutputs<T> layers;
@@ -1630,12 +1616,9 @@ void check_step(Case& c) {
         const float* update_noise = noise.data() + static_cast<size_t>(update - 1) * noise_stride;
         const Objective<T> result = learn(tape, *model, batch, update_noise, static_cast<T>(temperature), constrain);
         tape.watch = nullptr;
-        const auto numbers = [&](const auto& r) {
-            return std::array{static_cast<double>(r.L.value[0]), constrain ? static_cast<double>(r.H.value[0]) : 0.0,
-                              static_cast<double>(r.lagrangian.value[0])};
-        };
-        const auto here = numbers(result);
-        auto there = here;  // in float, from the second update on: with parameters that were not rounded
+        lists["L"].push_back(static_cast<double>(result.L.value[0]));
+        lists["loss"].push_back(static_cast<double>(result.lagrangian.value[0]));
+        if (constrain) lists["H"].push_back(static_cast<double>(result.H.value[0]));
         for (const auto& output : layers.outputs) {
             c.expect("layer/" + output.name, output.shape, output.value, true);
             c.expect("layer_gradient/" + output.name, output.shape,
@@ -1646,25 +1629,15 @@ void check_step(Case& c) {
                 c.expect("gradient/" + parameter.name, parameter.shape, parameter.gradient,
                          c.named("out/gradient/").empty());
         if constexpr (std::is_same_v<T, float>) {
-            if (update > 1) {
-                if (!unrounded) unrounded = std::make_unique<Transformer<double>>(config, 0);
-                for (size_t p = 0; p < model->parameters.size(); ++p) {
-                    unrounded->parameters[p].value = slack->exact[p];
-                    std::fill(unrounded->parameters[p].gradient.begin(), unrounded->parameters[p].gradient.end(), 0);
-                }
-                unrounded_tape.reset();
-                there = numbers(learn(unrounded_tape, *unrounded, batch, update_noise, temperature, constrain));
-            }
-            const auto off = gradient_off(model->parameters, c.tolerance("gradient").float32, unrounded.get());
+            const auto off = gradient_off(model->parameters, c.tolerance("gradient").float32);
             const auto before = values_of(model->parameters);
             const OptimizerConfig optimizer_settings = optimizer_config(settings);
             const double norm = update_parameters(c.compute, model->parameters, optimizer, optimizer_settings);
             const double clip = settings.clip_norm > 0 ? std::min(1.0, settings.clip_norm / (norm + 1e-6)) : 1.0;
             slack->add(before, off, clip, optimizer, optimizer_settings);
-            lists["gradient_norm"].add(norm, unrounded ? gradient_norm(c.compute, unrounded->parameters) : norm);
-            if (constrain)
-                lambda.step(c, settings, here[1],
-                            c.tolerance("H").float32 * std::fabs(here[1]) + std::fabs(here[1] - there[1]));
+            lists["gradient_norm"].push_back(norm);
+            const double H = constrain ? lists["H"].back() : 0;
+            if (constrain) lambda.step(c, settings, H, c.tolerance("H").float32 * std::fabs(H));
             const std::string after = "after_" + std::to_string(update) + "/";
             for (size_t p = 0; !c.named("out/" + after).empty() && p < model->parameters.size(); ++p) {
                 const std::string name = after + model->parameters[p].name;
@@ -1672,18 +1645,14 @@ void check_step(Case& c) {
                          slack->allowed(p, c.tolerance(name).float32), 0);
             }
         }
-        lists["L"].add(here[0], there[0]);
-        lists["H"].add(here[1], there[1]);
-        lists["loss"].add(here[2], there[2]);
     }
-    const auto hold = [&](const std::string& name, const auto& got, const std::vector<double>& off, double most) {
+    const auto expect = [&](const std::string& name, const auto& list, const std::vector<double>& more, double most) {
         const bool one = c.has("out/" + name) && c.need("out/" + name).shape.empty();
         const Shape shape = one ? Shape{} : shape_of(wanted);
-        c.expect(name, shape, one ? std::decay_t<decltype(got)>{got[0]} : got, name != "loss", off, most);
+        c.expect(name, shape, one ? std::decay_t<decltype(list)>{list[0]} : list, name != "loss", more, most);
     };
-    for (const auto& [name, list] : lists)
-        if (constrain || name != "H") hold(name, list.got, list.slack, INFINITY);
-    if (std::is_same_v<T, float> && constrain) hold("log_temperature", lambda.log_lambda, lambda.allowed, 0);
+    for (const auto& [name, list] : lists) expect(name, list, {}, INFINITY);
+    if (std::is_same_v<T, float> && constrain) expect("log_temperature", lambda.log_lambda, lambda.allowed, 0);
     for (const std::string& name : c.named("out/"))
         if (is_unused_parameter(name.substr(name.find('/') + 1))) c.find("out/" + name);
 }
