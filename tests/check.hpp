@@ -1,8 +1,8 @@
 // check.hpp: `wodtem check FILE...` recomputes golden vectors with the functions that training uses, and compares.
 // Included by wodtem.cpp. tests/vectors/README.md describes the files, well enough to write new ones by hand.
 //
-// In order: cases (inputs by name; outputs are compared with the file's, each within its stated tolerance); one function
-// for each topic, in porting order; the table of topics; files.
+// In order: cases (inputs by name; outputs are compared with the file's, each within its stated tolerance); one
+// function for each topic, in porting order; the table of topics; files.
 // Promises: files are untrusted. What is missing, unknown, of another shape or not counted is reported in a sentence
 // with file, tensor and offset. Every size and setting of a case comes from the file and is held to a range. Where the
 // code is templated on the scalar, a case is computed in double and in float.
@@ -118,7 +118,7 @@ struct Case {
     Precision precision = Precision::float64;  // of what is computed now
     bool rounded = false;                      // an input was no float32
     double worst = 0;                          // largest |wodtem - file| as a part of what is allowed
-    std::set<std::string> used = {};           // tensors and metadata entries that were asked for
+    std::set<std::string> used = {};           // tensors and metadata entries that the topic has read
     std::vector<std::string> problems = {};    // what does not hold
 
     std::string where(const StoredTensor& tensor) const {
@@ -136,7 +136,7 @@ struct Case {
         return found.size / about(found.dtype).size;
     }
     bool has(const std::string& tensor) const { return file.has(name + "/" + tensor); }
-    // Names of the case's tensors that begin like this, without it.
+    // The names of the case's tensors that begin with `start`, each without that beginning.
     std::set<std::string> named(const std::string& start) const {
         std::set<std::string> names;
         const std::string whole = name + "/" + start;
@@ -155,7 +155,8 @@ struct Case {
 
     void check_shape(const StoredTensor& tensor, const Shape& pattern) const {
         bool fits = tensor.shape.size() == pattern.size();
-        const uint64_t most = tensor.size == 0 ? 1 << 20 : (uint64_t{1} << 31) - 1;  // nothing may stand for billions
+        const uint64_t most =
+            tensor.size == 0 ? 1 << 20 : (uint64_t{1} << 31) - 1;  // an empty tensor may not claim billions of rows
         for (size_t i = 0; fits && i < pattern.size(); ++i)
             fits = tensor.shape[i] <= most && (pattern[i] == any || pattern[i] == tensor.shape[i]);
         if (pattern.empty()) fits = tensor.size == about(tensor.dtype).size;  // a number may have any rank
@@ -288,10 +289,10 @@ struct Case {
         }
     }
 
-    // Compares `wodtem`, what this program computed, with CASE/out/NAME of the file; of a longer list its first entries.
-    // Whole numbers must be equal. `optional`: the file may leave it out. `slack`: by how much more than the tolerance
-    // each entry may be off. `most`: an upper bound on the tolerance, where a wider one would hide the mistake that the
-    // output is for; 0: the slack is all but `absolute`.
+    // Compares `wodtem`, what this program computed, with CASE/out/NAME of the file; of a longer list in the file, the
+    // first entries. Whole numbers must be equal. `optional`: the file may leave it out. `slack`: by how much more than
+    // the tolerance each entry may be off. `most`: an upper bound on the tolerance, where a wider one would hide the
+    // mistake that the output is for; 0: the slack is all but `absolute`.
     template <class T>
     void expect(const std::string& output, const Shape& shape, const std::vector<T>& wodtem, bool optional = false,
                 const std::vector<double>& slack = {}, double most = INFINITY) {
@@ -679,7 +680,7 @@ struct Windows {
     }
 };
 
-// Actions that tanh can give.
+// Actions inside (-1, 1), where atanh is finite. Errors: check.value.
 std::vector<float> squashed_actions_in(Case& c, const std::string& name, const Shape& shape) {
     return c.in_range(name, shape, -1 + 0x1p-24f, 1 - 0x1p-24f, "above -1 and below 1").values;
 }
@@ -731,18 +732,18 @@ Windows read_windows(Case& c, const TransformerConfig& config) {
     return windows;
 }
 
-// The output of every layer of one pass, by name, and with gradients(), after backward, the loss's gradient at it.
+// The output of every layer of one forward pass, by name, and, after backward(), the gradient of the loss at it.
 template <class T>
 struct LayerOutputs {
     struct Output {
         std::string name;
         Shape shape;
-        std::vector<T> value;  // copied: backward() uses the memory for other things
+        std::vector<T> value;  // a copy: backward() may reuse the tape's memory
         const T* gradient;
     };
     std::vector<Output> outputs;
 
-    // Of the next forward() on this tape.
+    // Records the next forward() on this tape.
     void watch(Tape<T>& tape) {
         outputs.clear();
         tape.watch = [this](const std::string& name, const Tensor<T>& x) {
@@ -975,7 +976,7 @@ MemoryConfig memory_settings(Case& c, int state_dim, int action_dim, int project
     config.state_dim = state_dim;
     config.action_dim = action_dim;
     config.projected_dim = projected_dim;
-    // More room than rows changes nothing.
+    // A capacity above the number of rows changes nothing, so no more is allocated.
     config.capacity = std::min(n + 1, static_cast<size_t>(c.whole("capacity", static_cast<double>(n + 1), 1, 1e12)));
     config.K = static_cast<int>(c.whole("K", 1, 1, 100000));
     config.epsilon = c.number("epsilon", INFINITY, 0, INFINITY);
@@ -1133,7 +1134,8 @@ void check_weights(Case& c) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Topics: objective and optimiser
 
-// What a batch's steps are worth: weights [n] (1), remembered_actions (the actions); the mean over windows and steps.
+// The batch of the objective: weights [n] (default 1), remembered_actions (default: the actions), and the share of each
+// step in the mean over steps, then windows.
 Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& config) {
     Batch batch;
     batch.sequences = windows.sequences;
@@ -1153,7 +1155,7 @@ Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& confi
     return batch;
 }
 
-// What storing x in float32 takes off at most.
+// The largest error of storing x in float32.
 double half_ulp(double x) {
     const float y = std::fabs(static_cast<float>(x));
     return (static_cast<double>(std::nextafter(y, INFINITY)) - static_cast<double>(y)) / 2;
@@ -1166,7 +1168,7 @@ struct Slack {
     std::vector<double> moved;                  // [parameters] the largest step of an update, summed over updates
     std::vector<std::vector<double>> rounding;  // [parameters][size]
 
-    // inexact: the first values were no float32 in the file.
+    // inexact: the file's values were not float32 numbers, so reading them has rounded them already.
     Slack(const std::vector<Parameter<float>>& parameters, bool inexact)
         : off(parameters.size()),
           moved(parameters.size()) {
@@ -1177,11 +1179,11 @@ struct Slack {
         }
     }
 
-    // After an update. before: the values; gradient_off: what may be wrong with each gradient, before it is scaled by
-    // `clip`. Storage rounds to float32 (with AdamW's decay three times). Adam divides a gradient by its own size: where
-    // that is near rounding, as in the keys' bias, which softmax does not see, the step is noise over noise. Entries of
-    // a gradient are off by `off` at most, so are m and sqrt(v), and u = m / (sqrt(v) + epsilon) by (1 + |u|) off /
-    // (sqrt(v) + epsilon), or by 2 where that is more; by LAMB's ratio the norm of all that reaches every entry.
+    // Adds what one update does. before: the values before it; gradient_off: the possible error of each gradient before
+    // `clip` scales it. Adam divides a gradient by its own size; where that is close to rounding, as in the keys' bias,
+    // which softmax does not see, the step is noise divided by noise. If the entries of a gradient are off by at most
+    // `off`, so are m and sqrt(v), and u = m / (sqrt(v) + epsilon) is off by (1 + |u|) off / (sqrt(v) + epsilon), and
+    // by no more than 2. Through LAMB's ratio the norm of all these errors reaches every entry.
     void add(const std::vector<std::vector<float>>& before, const std::vector<double>& gradient_off, double clip,
              const Optimizer& optimizer, const OptimizerConfig& config) {
         const bool lamb = config.rule == OptimizerConfig::Rule::lamb;
@@ -1195,7 +1197,7 @@ struct Slack {
             for (size_t i = 0; i < n; ++i) {
                 const double divisor = std::sqrt(optimizer.second_moment[p][i] / bias2) + config.epsilon;
                 u[i] = optimizer.first_moment[p][i] / bias1 / divisor;
-                if (optimizer.second_moment[p][i] != 0)  // an exact 0 is no rounding: nothing leads there
+                if (optimizer.second_moment[p][i] != 0)  // v is exactly 0 only where no gradient ever was
                     du[i] = std::min(2.0, (1 + std::fabs(u[i])) * off[p] / divisor);
                 if (lamb) u[i] += config.weight_decay * before[p][i];
                 squares_of_value += static_cast<double>(before[p][i]) * before[p][i];
@@ -1220,7 +1222,7 @@ struct Slack {
         }
     }
 
-    // Of parameter p, with `relative` of its steps.
+    // The allowed error of each entry of parameter p; `relative` is the tolerance as a part of the steps.
     std::vector<double> allowed(size_t p, double relative) const {
         std::vector<double> all = rounding[p];
         for (double& x : all) x += relative * moved[p];
@@ -1234,7 +1236,7 @@ std::vector<std::vector<float>> values_of(const std::vector<Parameter<float>>& p
     return values;
 }
 
-// Log lambda, its optimiser, and how far both may be off.
+// Log lambda, its optimiser, and the allowed error of log lambda after each update.
 struct CheckedTemperature {
     Temperature temperature = Temperature(1);
     std::optional<Slack> slack = {};
@@ -1245,7 +1247,7 @@ struct CheckedTemperature {
         temperature.log_lambda[0].value[0] = static_cast<float>(value);
         slack.emplace(temperature.log_lambda, true);
     }
-    // After an update. H_off: what may be wrong with H.
+    // Takes one step of lambda. H_off: the possible error of H.
     void step(Case& c, const Settings& settings, double H, double H_off) {
         const auto before = values_of(temperature.log_lambda);
         OptimizerConfig config;
@@ -1746,7 +1748,7 @@ constexpr Topic topics[] = {
     {"env_", check_environment, nullptr},
 };
 
-// The cases of a file, in its order. Errors: what has no case, or a case that the metadata does not count.
+// The names of a file's cases, in its order. Errors: check.name, check.case, check.count.
 std::vector<std::string> cases_of(const TensorFile& file) {
     std::vector<std::string> cases;
     std::set<std::string> known;
@@ -1774,7 +1776,8 @@ std::vector<std::string> cases_of(const TensorFile& file) {
     return cases;
 }
 
-std::string printable(std::string text) {  // a file may not drive the terminal
+// Text of a file without control characters, which could drive the terminal.
+std::string printable(std::string text) {
     for (char& c : text)
         if (static_cast<unsigned char>(c) < ' ' || c == 0x7F) c = '?';
     return text;
@@ -1788,7 +1791,7 @@ std::string expected_error(const Case& c) {
     return result == "ok" ? "" : result;
 }
 
-// Of a case, where(): "tensor ... at byte ...: entry [0, 1] is nan" for the first input that is not finite.
+// Names the first input of a case that is not finite, as "tensor ... at byte ...: entry [0, 1] is nan"; else empty.
 std::string first_not_finite(const Case& c) {
     std::string text;
     for (const std::string& name : c.named("in/")) {
@@ -1816,7 +1819,7 @@ void print_inputs(const Case& c) {
             Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, entries(c.file, tensor));
 }
 
-// A case is computed by every function that its topic has; what none of them asked for is an error.
+// Computes a case with each function of its topic. Errors: check.unknown for what none of them reads.
 void check_case(Case& c, const Topic& topic) {
     if (c.verbose) print_inputs(c);
     for (const char* what : {"note", "source", "result"}) c.used.insert(c.name + "." + what);
@@ -1828,7 +1831,7 @@ void check_case(Case& c, const Topic& topic) {
     if (!outputs.empty() && !expected_error(c).empty())
         fail("check.unknown", "%s: is not looked at, for CASE.result says that an error is expected; leave one out",
              c.where(c.need("out/" + *outputs.begin())).c_str());
-    if (topic.in_float) {  // first: it finds out whether the inputs are floats
+    if (topic.in_float) {  // first, because reading inputs as float shows whether they are float32 numbers
         c.precision = Precision::float32;
         topic.in_float(c);
     }
@@ -1854,8 +1857,8 @@ void check_case(Case& c, const Topic& topic) {
     }
 }
 
-// Prints a line, and more of what does not hold. Returns whether all does. Errors: what makes the file none of vectors,
-// and, after all cases were computed, the first that is malformed.
+// Checks every case of a file, prints a line for the file and a few for each failing case; returns whether all hold.
+// Errors: a file that is not one of vectors; after all cases have been computed, the first malformed case.
 bool check_file(const std::string& path, Compute& compute, bool verbose) {
     const TensorFile file = read_safetensors(path);
     const std::string& name = file.text("topic");

@@ -3,7 +3,8 @@
 
 It shares no code with the project: equations written again, in NumPy and PyTorch, in float64, in the plainest form that
 each has, with gradients by PyTorch's autograd; the physics by MuJoCo's own library through a few lines of C. The files
-were made on 2026-11-24 by Debian 12's python3 3.11.2, python3-numpy 1.24.2, python3-torch 1.13.0a0 and libmujoco 2.2.2:
+were made on 2026-11-24 and 2026-11-29 by Debian 12's python3 3.11.2, python3-numpy 1.24.2, python3-torch 1.13.0a0 and
+libmujoco 2.2.2:
 
     python3 tests/vectors/peer.py            # writes every file beside it
     python3 tests/vectors/peer.py linear     # or those named
@@ -1439,8 +1440,8 @@ def optimizer():
          **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
     case("norm_far_above_clip", "a norm of a hundred times the clip", q, three(100.0),
          **dict(common, clip_norm=0.25, optimizer_epsilon=0.125))
-    case("clip_leaves_small_gradients", "a clip that scales small gradients up to the clip: norms of 0.02, 0.07 and 0.005 "
-         "stay apart, and so do the steps", p,
+    case("clip_leaves_small_gradients", "a clip that scales small gradients up to the clip: norms of 0.02, 0.07 and "
+         "0.005 stay apart, and so do the steps", p,
          {k: v[:3] * 2.0**np.array([-7, -5, -9]).reshape(3, *[1] * (v.ndim - 1)) for k, v in g.items()},
          **dict(common, clip_norm=0.25))
     large = {"norm_8": (4, 3), "norm_90_small_steps": (12, 8), "norm_90_large_steps": (12, 8)}
@@ -1713,8 +1714,8 @@ def step():
                 if x == "log_temperature" or apart == 0:
                     f.tolerance(name, x, f"float64 1e-12, float32 {k * U:.2g}: as the case")
                 else:
-                    f.tolerance(name, x, f"float64 1e-12, float32 {k * U + apart:.2g}: as the case, and {apart:.2g}, twice "
-                                "what storing parameters in float32 does")
+                    f.tolerance(name, x, f"float64 1e-12, float32 {k * U + apart:.2g}: as the case, and {apart:.2g}, "
+                                "twice what storing parameters in float32 does")
 
     case("tiny", "ten whole updates: any mistake that the other files miss; which tensor is wrong first says where")
     case("alpha_one", "plain ODT: all weights 1, full windows given as [windows, C, ...], no lengths", lengths=(3, 3),
@@ -2075,9 +2076,9 @@ def maze2d(e, f, case):
     f.save()
 
 
-TOPICS = [rng, initialisation, returns, linear, layernorm, mlp, attention, tokens, acting, policy_gaussian, policy_discrete,
-          policy_deterministic, memory_update, memory_lookup, memory_action, weights, objective, optimizer, sampling,
-          normalize, gridworld, step, environments]
+TOPICS = [rng, initialisation, returns, linear, layernorm, mlp, attention, tokens, policy_gaussian, policy_discrete,
+          policy_deterministic, acting, memory_update, memory_lookup, memory_action, weights, objective, optimizer,
+          sampling, normalize, gridworld, step, environments]
 
 if __name__ == "__main__":
     for make in TOPICS:
