@@ -589,8 +589,9 @@ bool is_unused_parameter(const std::string& name) {
            name.ends_with(".attn.masked_bias");
 }
 
-// The sizes of the network whose weights are in/parameter/NAME, under ODT's names. Setting: heads.
-TransformerConfig read_config(Case& c) {
+// The network whose weights are in/parameter/NAME, under ODT's names; its sizes are theirs. Setting: heads.
+template <class T>
+std::unique_ptr<Transformer<T>> read_model(Case& c) {
     const std::set<std::string> names = c.named("in/parameter/");
     const auto shape = [&](const std::string& name) {
         const StoredTensor& tensor = c.need("in/parameter/" + name);
@@ -612,24 +613,13 @@ TransformerConfig read_config(Case& c) {
     config.head = names.contains("predict_action.logits.weight") ? Head::categorical
                   : names.contains("predict_action.0.weight")    ? Head::deterministic
                                                                  : Head::squashed_gaussian;
-    return config;
-}
-
-// Copies in/parameter/NAME into the network.
-template <class T>
-void read_parameters(Case& c, Transformer<T>& model) {
-    for (Parameter<T>& parameter : model.parameters) {
+    auto model = std::make_unique<Transformer<T>>(config, 0);
+    for (Parameter<T>& parameter : model->parameters) {
         const Array<T> array = c.in<T>("parameter/" + parameter.name, parameter.shape);
         std::copy(array.values.begin(), array.values.end(), parameter.value.begin());
     }
-    for (const std::string& name : c.named("in/parameter/"))
+    for (const std::string& name : names)
         if (is_unused_parameter(name)) c.find("in/parameter/" + name);
-}
-
-template <class T>
-std::unique_ptr<Transformer<T>> read_model(Case& c) {
-    auto model = std::make_unique<Transformer<T>>(read_config(c), 0);
-    read_parameters(c, *model);
     return model;
 }
 
@@ -796,7 +786,8 @@ struct Recording {
 // returns_to_go [T + 1]; mean, log_std [T, A] or log_probabilities [T, moves]; noise [T, A] or uniform [T]; of the
 // windows, one after the other, window/lengths [T], timesteps, returns_to_go [n], states [n, S], actions [n - T, A].
 void check_acting(Case& c) {
-    const TransformerConfig config = read_config(c);
+    const auto model = read_model<float>(c);
+    const TransformerConfig& config = model->config;
     const bool discrete = config.head == Head::categorical;
     const uint64_t S = static_cast<uint64_t>(config.state_dim), A = static_cast<uint64_t>(config.action_dim);
     const Array<float> states = c.in<float>("states", {any, S});
@@ -817,11 +808,13 @@ void check_acting(Case& c) {
     spec.state_dim = config.state_dim;
     spec.action_dim = discrete ? 1 : config.action_dim;
     spec.moves = discrete ? config.action_dim : 0;
-    Agent agent{settings,
-                spec,
-                Transformer<float>(config, 0),
-                {c.in<float>("state_mean", {S}).values, c.in<float>("state_deviation", {S}).values}};
-    read_parameters(c, agent.model);
+    // The agent prepares windows and chooses actions; its own network, of which only the kind of head counts, is small.
+    const bool deterministic = config.head == Head::deterministic;
+    settings.method = deterministic ? "dt" : "odt";
+    settings.layers = settings.heads = 1;
+    settings.width = deterministic ? 8 : std::max(8, config.action_dim);
+    Agent agent{settings, spec, Transformer<float>(transformer_config(settings, spec), 0), {}};
+    agent.normaliser = {c.in<float>("state_mean", {S}).values, c.in<float>("state_deviation", {S}).values};
 
     Recording environment{states, rewards};
     std::vector<Episode> episodes(1);
@@ -843,7 +836,7 @@ void check_acting(Case& c) {
         append(window_states, window.states.data(), n * S);
         append(window_actions, window.actions.data(), (n - 1) * A);
         tape.reset();
-        const Policy<float> policy = forward(tape, agent.model, window, Queries::last_state);
+        const Policy<float> policy = forward(tape, *model, window, Queries::last_state);
         append(policies, policy.output.value, A);
         if (config.head == Head::squashed_gaussian) append(log_std, policy.log_std.value, A);
         for (uint32_t i = 0; i < A; ++i) noise.push_back(random.normal(number, t, i));
