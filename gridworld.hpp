@@ -5,35 +5,19 @@
 // has 5 steps. The paper does not say what a move off the grid does or how a state is encoded, and under none of the
 // four edge rules below can the behaviour policy it states have collected the data set it describes (the numbers are
 // at chain_statistics). Each reading is a setting; the defaults agree with the printed statistics.
-// Promises: all chance is integers drawn by counter, so a seed is the same data set on every machine; what is not a
-// move is an error. Leaves out: the time limit, which the caller of step() counts; returns (memory.hpp); networks.
+// Promises: all random draws are integers drawn by counter, so a seed gives the same data set on every machine; an
+// action that is no move is an error. Leaves out: the time limit, which play() counts; returns (memory.hpp); networks.
 #pragma once
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
 #include "memory.hpp"
 #include "nn.hpp"
-
-// ---------------------------------------------------------------------------------------------------------------------
-// What every environment of the project offers: spec(), reset() and step() with these two records.
-
-constexpr uint64_t data_set_episodes = uint64_t{1} << 41;  // the numbers of a data set's episodes start here
-
-struct EnvironmentSpec {
-    int state_dim;          // floats per state
-    int action_dim;         // floats per stored action; a discrete action is one float, the index of the move
-    int moves;              // number of discrete actions; 0: actions are continuous
-    int max_episode_steps;  // the time limit, in steps
-};
-
-struct Step {
-    double reward;
-    bool terminated;  // the task ended the episode; running into the time limit is not termination
-};
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Cells and moves. A cell is numbered row * 6 + column; rows grow downwards, columns to the right.
@@ -66,10 +50,10 @@ constexpr int move_right = 0, move_down = 1, move_left = 2;
 
 // What a move off the grid does; the paper does not say.
 enum class EdgeRule {
-    clipped,   // the part that leaves is dropped, the other part happens: a diagonal slides along the wall
-    stays,     // the whole move is void
-    wraps,     // the grid is a torus; then S and G touch and the shortest path has 1 step, so not the paper's grid
-    excluded,  // the behaviour policy never chooses one; should another policy do so, the move is void
+    clipped,   // the component that leaves the grid is dropped, the other one happens: a diagonal slides along the wall
+    stays,     // the agent stays where it is
+    wraps,     // the grid is a torus; S and G are then neighbours, the shortest path has 1 step: not the paper's grid
+    excluded,  // the behaviour policy never chooses such a move; if another policy does, the agent stays where it is
 };
 constexpr std::array<const char*, 4> edge_rule_names{"clipped", "stays", "wraps", "excluded"};
 
@@ -97,23 +81,28 @@ enum class StateEncoding {
 };
 constexpr std::array<const char*, 2> state_encoding_names{"coordinates", "one_hot"};
 
-struct GridWorld {
-    EdgeRule edge = EdgeRule::clipped;
-    StateEncoding encoding = StateEncoding::coordinates;
-    int cell = grid_start;  // all that changes during an episode
+struct GridWorld : Environment {
+    EdgeRule edge;
+    StateEncoding encoding;
+    int cell = grid_start;  // the agent's; nothing else changes during an episode
 
-    EnvironmentSpec spec() const {
+    explicit GridWorld(EdgeRule rule = EdgeRule::clipped, StateEncoding states = StateEncoding::coordinates)
+        : edge(rule),
+          encoding(states) {}
+
+    EnvironmentSpec spec() const override {
         return {encoding == StateEncoding::one_hot ? grid_cells : 2, 1, grid_moves, grid_max_steps};
     }
 
-    // state [state_dim]. Every episode starts at S, so neither argument is used; other environments draw from them.
-    void reset(const Random& /*environment*/, uint64_t /*episode*/, float* state) {
+    // state [state_dim]. Every episode starts at S, so the random numbers and the episode's number are not used.
+    void reset(const Random& /*random*/, uint64_t /*episode*/, float* state) override {
         cell = grid_start;
         observe(state);
     }
 
-    // action [1]: the index of a move; state [state_dim]: where it led. Not to be called after termination.
-    Step step(const float* action, float* state) {
+    // action [1]: the index of a move; state [state_dim]: the one that follows. Errors: gridworld.bad_action,
+    // gridworld.episode_over (a step after termination).
+    Step step(const float* action, float* state) override {
         const float move = *action;
         if (!(move >= 0 && move < grid_moves && move == std::floor(move)))  // written so that NaN fails
             fail("gridworld.bad_action", "grid world: a move is a whole number from 0 to %d, got %g", grid_moves - 1,
@@ -123,6 +112,8 @@ struct GridWorld {
         observe(state);
         return {cell == grid_goal ? 1.0 : 0.0, cell == grid_goal};
     }
+
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<GridWorld>(*this); }
 
     void observe(float* state) const {
         if (encoding == StateEncoding::one_hot) {
@@ -158,9 +149,7 @@ inline std::array<int, grid_moves> behaviour_weights(Behaviour behaviour, EdgeRu
 }
 
 inline int weight_sum(const std::array<int, grid_moves>& weights) {
-    int sum = 0;
-    for (int weight : weights) sum += weight;
-    return sum;
+    return std::accumulate(weights.begin(), weights.end(), 0);
 }
 
 // The move whose share of [0, sum of the weights) contains the draw.
@@ -171,23 +160,15 @@ inline int draw_move(const std::array<int, grid_moves>& weights, const Random& r
     return move;
 }
 
-// One episode of the behaviour policy, cut at the time limit.
+// One episode of the behaviour policy, cut at the time limit. `number`: of the trajectory within the data set.
 inline Trajectory collect_trajectory(GridWorld world, Behaviour behaviour, uint32_t seed, uint64_t number) {
-    const EnvironmentSpec spec = world.spec();
-    Trajectory trajectory;
-    trajectory.terminated = false;
-    std::vector<float> state(spec.state_dim);
-    world.reset(Random{seed, Stream::environment}, data_set_episodes + number, state.data());
-    for (int time = 0; time < spec.max_episode_steps && !trajectory.terminated; ++time) {
+    const Random resets{seed, Stream::environment}, moves{seed, Stream::data_set};
+    const auto choose = [&](const Episode& episode) {
         const auto weights = behaviour_weights(behaviour, world.edge, world.cell);
-        const float action = static_cast<float>(draw_move(weights, Random{seed, Stream::data_set}, number, time));
-        trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
-        trajectory.actions.push_back(action);
-        const Step step = world.step(&action, state.data());
-        trajectory.rewards.push_back(static_cast<float>(step.reward));
-        trajectory.terminated = step.terminated;
-    }
-    return trajectory;
+        const int move = draw_move(weights, moves, number, episode.trajectory.length());
+        return std::vector<float>{static_cast<float>(move)};
+    };
+    return play(world, resets, data_set_episodes + number, choose).trajectory;
 }
 
 // Sec. IV-A: mean length 47.50, mean return 0.91. The first seed from 0 upwards whose 500 trajectories under
@@ -204,7 +185,7 @@ inline std::vector<Trajectory> collect_data_set(const GridWorld& world, Behaviou
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// What the behaviour policy gives on average, without sampling.
+// The exact expectations of the behaviour policy's data, without sampling.
 
 struct ChainStatistics {
     double mean_length, sd_length;  // steps per trajectory
@@ -213,7 +194,7 @@ struct ChainStatistics {
 
 // Under the behaviour policy an episode is a Markov chain on the 36 cells. With p_t the distribution over cells after t
 // steps (p_0: all at S; p_t = p_0 times the t-th power of the transition matrix, G absorbing) and s_t = 1 - p_t[G] the
-// chance to be on the way still, the length l of a trajectory, cut at 100, has
+// probability that G is not reached within t steps, the length l of a trajectory, cut at 100, has
 //   E[l] = sum of s_t over t < 100,   E[l^2] = sum of (2t + 1) s_t over t < 100,   E[return] = p_100[G].
 // Mean length / return:    clipped         stays           wraps           excluded
 //   right_down             49.81 / 0.884   54.89 / 0.840   35.37 / 0.919   45.38 / 0.914

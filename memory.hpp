@@ -9,28 +9,23 @@
 // trajectory leaves the table as it was. Leaves out: networks, files, threads (many threads may call search() at once).
 //
 // Memory per entry, with projected_dim 4 and action_dim 8: 88 bytes are saved (key 16, projected state 16, action 32,
-// e 8, priority 8, age 8); the hash table, the eviction heap and the search tree are derived from them and take about as
-// much again. The raw state is not kept. Times of a look-up, an insertion and an eviction: tests/BENCH.md.
+// e 8, priority 8, age 8); the hash table, the eviction heap and the search tree are derived from them and take about
+// as much again. The raw state is not kept. Times of a look-up, an insertion and an eviction: tests/BENCH.md.
 #pragma once
 
-#include <algorithm>
-#include <array>
-#include <bit>
-#include <cmath>
-#include <cstdint>
+#include <exception>
 #include <limits>
+#include <queue>
 #include <span>
-#include <utility>
-#include <vector>
 
-#include "nn.hpp"
+#include "nn.hpp"  // and with it the other standard headers
 
 // The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
 namespace Stream {
-constexpr uint32_t batch = 3;              // step: update; index: window of the batch
-constexpr uint32_t exploration = 4;        // step: episode; site: action dimension; index: time-step
-constexpr uint32_t remembered_action = 5;  // eq. (6). step: update; index: window * context_length + step in the window
-constexpr uint32_t entropy_noise = 6;      // the same; site: action dimension
+constexpr uint32_t batch = 3;           // step: update; index: window of the batch
+constexpr uint32_t exploration = 4;     // step: episode; site: action dimension; index: time-step
+constexpr uint32_t advised_action = 5;  // eq. (6). step: update; index: window * context_length + step in the window
+constexpr uint32_t entropy_noise = 6;   // the same; site: action dimension
 constexpr uint32_t environment = 7;  // step: episode (evaluations from 2^40, data sets from 2^41); index: draw in reset
 constexpr uint32_t projection = 8;   // step: 0; index: element of the random projection
 constexpr uint32_t data_set = 9;     // step: trajectory; index: time-step; site: action dimension
@@ -71,20 +66,22 @@ void check_finite(const char* what, const Number* values, size_t count) {
                  static_cast<double>(values[i]));
 }
 
-inline void check_size(const char* what, size_t got, size_t steps, size_t width) {
-    if (got != steps * width)
-        fail("memory.shape", "%zu %s for %zu steps, expected %zu", got, what, steps, steps * width);
+// Refuses a column of a trajectory of `steps` steps that has not `width` finite numbers a step. Errors: memory.shape,
+// memory.not_finite.
+template <class Number>
+void check_column(const char* what, const std::vector<Number>& column, size_t steps, size_t width) {
+    if (column.size() != steps * width)
+        fail("memory.shape", "%zu %s for %zu steps, expected %zu", column.size(), what, steps, steps * width);
+    check_finite(what, column.data(), column.size());
 }
 
 // Validates a trajectory and computes both returns from its rewards; targets used while acting play no part.
 inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, double gamma) {
     const size_t T = trajectory.rewards.size();
     if (T == 0) fail("memory.shape", "a trajectory has no steps, expected at least one");
-    check_size("states", trajectory.states.size(), T, static_cast<size_t>(state_dim));
-    check_size("actions", trajectory.actions.size(), T, static_cast<size_t>(action_dim));
-    check_finite("states", trajectory.states.data(), trajectory.states.size());
-    check_finite("actions", trajectory.actions.data(), trajectory.actions.size());
-    check_finite("rewards", trajectory.rewards.data(), T);
+    check_column("states", trajectory.states, T, state_dim);
+    check_column("actions", trajectory.actions, T, action_dim);
+    check_column("rewards", trajectory.rewards, T, 1);
     trajectory.returns_to_go = returns_to_go(trajectory.rewards);
     trajectory.discounted_returns = discounted_returns(trajectory.rewards, gamma);
 }
@@ -104,6 +101,123 @@ inline std::vector<Trajectory> offline_set(std::vector<Trajectory> trajectories,
     if (!keep_lowest && trajectories.size() > 1)
         trajectories.erase(std::min_element(trajectories.begin(), trajectories.end(), lower_return));
     return trajectories;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Environments and episodes.
+
+constexpr uint64_t data_set_episodes = uint64_t{1} << 41;  // the numbers of a data set's episodes start here
+
+struct EnvironmentSpec {
+    int state_dim;          // floats per state
+    int action_dim;         // floats per stored action; a discrete action is one float, its index
+    int discrete_actions;   // how many there are to choose from; 0: actions are continuous
+    int max_episode_steps;  // the time limit, in steps
+};
+
+struct Step {
+    double reward;
+    bool terminated;  // the task ended the episode; running into the time limit is not termination
+};
+
+// Every task offers these four operations. An object plays one episode at a time and does not count the time limit.
+struct Environment {
+    virtual ~Environment() = default;
+    virtual EnvironmentSpec spec() const = 0;
+    // Begins an episode and writes its first state [state_dim], which is a function of (random, episode).
+    virtual void reset(const Random& random, uint64_t episode, float* state) = 0;
+    // Takes an action [action_dim] and writes the state [state_dim] that follows. Errors: environment.unstable where
+    // the simulation broke down; the caller must then drop the episode.
+    virtual Step step(const float* action, float* state) = 0;
+    virtual std::unique_ptr<Environment> clone() const = 0;
+};
+
+// An episode while it is played, and afterwards.
+struct Episode {
+    uint64_t number = 0;         // which decides its first state and all its random numbers
+    Trajectory trajectory;       // the steps made so far, without returns
+    std::vector<float> state;    // [state_dim] the present state
+    std::vector<float> targets;  // [t + 1] scaled returns-to-go that a return-conditioned policy was given, else empty
+    double reward = 0;           // of the latest step; the trajectory holds it as a float
+    double total_reward = 0;     // of all steps so far, undiscounted
+    bool over = false;           // by termination or by an error
+    std::string error;           // the sentence of environment.unstable, else empty
+    std::exception_ptr thrown;   // any other error, on its way out of a worker thread
+
+    // Takes one step of the environment, whose state this episode's is.
+    void step(Environment& environment, const float* action, int action_dim) {
+        trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
+        trajectory.actions.insert(trajectory.actions.end(), action, action + action_dim);
+        try {
+            const Step step = environment.step(action, state.data());
+            reward = step.reward;
+            over = trajectory.terminated = step.terminated;
+        } catch (const Error& failure) {
+            over = true;
+            reward = 0;
+            error = failure.what();
+            if (failure.id != "environment.unstable") thrown = std::current_exception();
+        } catch (...) {
+            thrown = std::current_exception();
+        }
+        trajectory.rewards.push_back(static_cast<float>(reward));
+        total_reward += reward;
+    }
+};
+
+// Copies of an environment, for episodes side by side.
+struct Environments {
+    std::vector<std::unique_ptr<Environment>> copies;
+    std::vector<Environment*> pointers;
+
+    Environments(const Environment& environment, int64_t count) {
+        for (int64_t i = 0; i < count; ++i) {
+            copies.push_back(environment.clone());
+            pointers.push_back(copies.back().get());
+        }
+    }
+    std::span<Environment* const> all() const { return pointers; }
+    std::span<Environment* const> first() const { return std::span(pointers).first(1); }
+};
+
+// Plays one episode in each environment, numbered from `first` on, in lockstep up to termination or the time limit.
+// choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over. Environments step
+// on `threads`, if given.
+template <class Choose>
+std::vector<Episode> play(std::span<Environment* const> environments, const Random& resets, uint64_t first,
+                          Choose&& choose, Threads* threads = nullptr) {
+    const EnvironmentSpec spec = environments[0]->spec();
+    std::vector<Episode> episodes(environments.size());
+    for (size_t i = 0; i < episodes.size(); ++i) {
+        episodes[i].number = first + i;
+        episodes[i].state.resize(spec.state_dim);
+        environments[i]->reset(resets, first + i, episodes[i].state.data());
+    }
+    for (int t = 0; t < spec.max_episode_steps; ++t) {
+        std::vector<Episode*> running;
+        for (Episode& episode : episodes)
+            if (!episode.over) running.push_back(&episode);
+        if (running.empty()) break;
+        const std::vector<float> actions = choose(std::span<Episode* const>(running));
+        const auto step = [&](int i, int) {
+            Environment& environment = *environments[running[i] - episodes.data()];
+            running[i]->step(environment, &actions[i * spec.action_dim], spec.action_dim);
+        };
+        const int count = static_cast<int>(running.size());
+        if (threads) threads->run(count, step);
+        for (int i = 0; !threads && i < count; ++i) step(i, 0);
+        for (const Episode* episode : running)
+            if (episode->thrown) std::rethrow_exception(episode->thrown);
+    }
+    return episodes;
+}
+
+// The same for one environment: choose(episode) returns one action [action_dim].
+template <class Choose>
+Episode play(Environment& environment, const Random& resets, uint64_t number, Choose&& choose) {
+    Environment* const environments[] = {&environment};
+    auto episodes = play(environments, resets, number, [&](auto running) { return choose(*running[0]); });
+    return std::move(episodes[0]);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -168,59 +282,6 @@ struct ReplayBuffer {
         const auto trajectory = static_cast<size_t>(end - ends.begin());
         return {trajectory, trajectories[trajectory].length() - left, std::min(context_length, left)};
     }
-
-    // Saved packed: trajectories laid end to end. `archive(name, field)` writes or, when archive.loading, reads.
-    template <class Archive>
-    void visit(Archive& archive) {
-        std::vector<float> states, actions, rewards;
-        std::vector<uint32_t> lengths, terminated;
-        const auto append = [](auto& all, const auto& part) { all.insert(all.end(), part.begin(), part.end()); };
-        for (const Trajectory& trajectory : trajectories) {
-            if (archive.loading) break;
-            append(states, trajectory.states);
-            append(actions, trajectory.actions);
-            append(rewards, trajectory.rewards);
-            lengths.push_back(static_cast<uint32_t>(trajectory.length()));
-            terminated.push_back(trajectory.terminated);
-        }
-        archive("replay.states", states);
-        archive("replay.actions", actions);
-        archive("replay.rewards", rewards);
-        archive("replay.lengths", lengths);
-        archive("replay.terminated", terminated);
-        archive("replay.next", next);
-        if (archive.loading) unpack(states, actions, rewards, lengths, terminated);
-    }
-
-    void unpack(const std::vector<float>& states, const std::vector<float>& actions, const std::vector<float>& rewards,
-                const std::vector<uint32_t>& lengths, const std::vector<uint32_t>& terminated) {
-        const auto S = static_cast<size_t>(state_dim), A = static_cast<size_t>(action_dim);
-        size_t steps = 0;
-        for (const uint32_t length : lengths) steps += length;
-        if (lengths.size() != terminated.size() || lengths.size() > capacity || steps != rewards.size() ||
-            states.size() != steps * S || actions.size() != steps * A || next >= std::max<size_t>(capacity, 1) ||
-            (lengths.size() < capacity && next != 0))
-            fail("checkpoint.replay",
-                 "the replay buffer does not fit together: %zu trajectories of %zu steps in all (at most %zu "
-                 "trajectories), %zu flags, %zu states of %zu, %zu actions of %zu, %zu rewards, next %zu",
-                 lengths.size(), steps, capacity, terminated.size(), states.size(), S, actions.size(), A,
-                 rewards.size(), static_cast<size_t>(next));
-        trajectories.clear();
-        const auto slice = [](const std::vector<float>& all, size_t first, size_t count) {
-            return std::vector<float>(all.data() + first, all.data() + first + count);
-        };
-        for (size_t i = 0, t = 0; i < lengths.size(); t += lengths[i], ++i) {
-            const size_t T = lengths[i];
-            Trajectory trajectory;
-            trajectory.states = slice(states, t * S, T * S);
-            trajectory.actions = slice(actions, t * A, T * A);
-            trajectory.rewards = slice(rewards, t, T);
-            trajectory.terminated = terminated[i] != 0;
-            relabel(trajectory, state_dim, action_dim, gamma);
-            trajectories.push_back(std::move(trajectory));
-        }
-        count_steps();
-    }
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -261,217 +322,203 @@ struct Points {
     }
 };
 
-// A bucket k-d tree (Friedman, Bentley and Finkel, 1977) that grows and shrinks with the table. An inner node parts its
-// entries by a plane: coordinate `dim` is at most `split` below its low child and at least `split` below its high child.
-// Equal coordinates may thus lie on both sides, and identical points can be divided like any others. A leaf holds up to
-// 16 entries; their coordinates lie side by side, so that one pass of vector code gives all distances. A node with a
-// child of more than 3/4 of its entries, or with too few entries for two leaves, is built anew. So no path is longer
-// than about log(n) / log(4/3), whatever the order of insertions and removals. No result depends on the tree's shape.
+// A bucket k-d tree (Friedman, Bentley and Finkel, 1977), kept shallow like a scapegoat tree (Galperin and Rivest,
+// 1993). An inner node divides its entries by the order of (coordinate, entry number), so identical points are divided
+// like any others, and an entry belongs to exactly one leaf. A leaf holds up to 16 entries; their coordinates lie side
+// by side, so that one pass of vector code gives all distances. A subtree too deep for its number of entries is built
+// anew, and so is the whole tree when its leaves hold fewer than 4 entries on average. Insertions and removals take
+// O(log(n)^2) amortised, whatever their order. No result depends on the tree's shape.
 struct KdTree {
     static constexpr uint32_t lanes = 16;         // entries in a full leaf
     static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `dim` in a leaf
-    static constexpr size_t longest_path = 96;    // log(2^31) / log(4/3) = 75, and some for rounding
+    static constexpr size_t longest_path = 48;    // planes above a leaf: log(2^31 / 16) / log(3/2) = 46.2, and one more
 
     template <class Number>
     struct alignas(64) Lanes : std::array<Number, lanes> {};
     struct Node {
         uint32_t child;  // inner node: its low child, the high child follows it. Leaf: its place in the arrays below
         uint32_t dim;
-        float split;
-        uint32_t count;  // entries below
+        float split;      // inner node: (split, number) is the first of the high child's entries in the order above
+        uint32_t number;  // leaf: of its entries
     };
-    using Ranked = std::pair<float, uint32_t>;  // (coordinate, entry)
 
-    size_t dim = 0;
+    size_t dim = 0, size = 0;
     std::vector<Node> nodes;                // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
-    std::vector<uint32_t> parents;          // [pair]
     std::vector<Lanes<float>> coordinates;  // [place, dim]
     std::vector<Lanes<uint32_t>> entries;   // [place] there is one place for each pair
-    std::vector<uint32_t> home;             // [entry] the node of its leaf
     std::vector<uint32_t> free_pairs;
 
-    // A tree of the table's first n entries.
-    void build(const Points& points, size_t point_dim, uint32_t n) {
-        *this = {};
-        dim = point_dim;
-        std::vector<Ranked> order(n);
-        for (uint32_t i = 0; i < n; ++i) order[i].second = i;
-        take_pair();
-        build_node(points, 0, 0, order);
+    // A tree of the entries in `order`.
+    void build(const Points& points, size_t point_dim, std::vector<uint32_t> order) {
+        *this = {point_dim, order.size(), {}, {}, {}, {}};
+        build_node(points, 0, take_pair(), order);
     }
 
-    // Halves the entries by the dimension of the largest extent until they fit leaves. The low child gets the node's
-    // place and the high child that of the new pair; so a subtree that is built anew needs no place from elsewhere.
-    void build_node(const Points& points, uint32_t node, uint32_t place, std::span<Ranked> order) {
+    // Halves the entries along the dimension of the largest extent until they fit leaves. The low child gets the node's
+    // place and the high child that of the new pair.
+    void build_node(const Points& points, uint32_t node, uint32_t place, std::span<uint32_t> order) {
         nodes[node] = {place, leaf, 0.0f, 0};
         if (order.size() <= lanes) {
-            for (const Ranked& ranked : order) put(points, node, ranked.second);
+            for (const uint32_t entry : order) put(points, nodes[node], entry);
             return;
         }
-        uint32_t widest = 0;
-        float extent = -1.0f;
+        std::pair<float, uint32_t> widest = {};  // (extent, dimension)
         for (uint32_t d = 0; d < dim; ++d) {
-            for (Ranked& ranked : order) ranked.first = points.rows[ranked.second * dim + d];
-            const auto [least, most] = std::minmax_element(order.begin(), order.end());
-            if (most->first - least->first > extent) widest = d;
-            extent = std::max(extent, most->first - least->first);
+            float least = INFINITY, most = -INFINITY;
+            for (const uint32_t entry : order) {
+                least = std::min(least, points.rows[entry * dim + d]);
+                most = std::max(most, points.rows[entry * dim + d]);
+            }
+            widest = std::max(widest, {most - least, d});
         }
-        for (Ranked& ranked : order) ranked.first = points.rows[ranked.second * dim + widest];
-        const size_t half = order.size() / 2;
-        std::nth_element(order.begin(), order.begin() + static_cast<ptrdiff_t>(half), order.end());
-        const uint32_t pair = take_pair(), low = 2 * pair;
-        parents[pair] = node;
-        nodes[node] = {low, widest, order[half].first, static_cast<uint32_t>(order.size())};
-        build_node(points, low, place, order.first(half));
-        build_node(points, low + 1, pair, order.subspan(half));
+        const auto half = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
+        const auto rank = [&](uint32_t entry) { return std::pair(points.rows[entry * dim + widest.second], entry); };
+        std::ranges::nth_element(order, half, {}, rank);
+        const uint32_t pair = take_pair();
+        nodes[node] = {2 * pair, widest.second, rank(*half).first, *half};
+        build_node(points, 2 * pair, place, {order.begin(), half});
+        build_node(points, 2 * pair + 1, pair, {half, order.end()});
     }
 
     uint32_t take_pair() {
         if (free_pairs.empty()) {
-            const size_t pairs = parents.size() + 1;
-            free_pairs.push_back(static_cast<uint32_t>(pairs - 1));
-            nodes.resize(2 * pairs);
-            parents.resize(pairs);
-            coordinates.resize(pairs * dim);
-            entries.resize(pairs);
+            free_pairs.push_back(static_cast<uint32_t>(entries.size()));
+            nodes.resize(nodes.size() + 2);
+            coordinates.resize(coordinates.size() + dim);
+            entries.emplace_back();
         }
         const uint32_t pair = free_pairs.back();
         free_pairs.pop_back();
         return pair;
     }
 
-    void put(const Points& points, uint32_t node, uint32_t entry) {
-        const uint32_t place = nodes[node].child, lane = nodes[node].count++;
-        for (size_t d = 0; d < dim; ++d) coordinates[place * dim + d][lane] = points.rows[entry * dim + d];
-        entries[place][lane] = entry;
-        if (entry >= home.size()) home.resize(entry + 1);
-        home[entry] = node;
+    void put(const Points& points, Node& node, uint32_t entry) {
+        const uint32_t lane = node.number++;
+        for (size_t d = 0; d < dim; ++d) coordinates[node.child * dim + d][lane] = points.rows[entry * dim + d];
+        entries[node.child][lane] = entry;
     }
 
-    bool unbalanced(uint32_t node) const {
-        const auto [child, plane_dim, split, n] = nodes[node];
-        return plane_dim != leaf &&
-               (n <= lanes / 2 || std::max(nodes[child].count, nodes[child + 1].count) > n - n / 4);
-    }
-
-    void insert(const Points& points, uint32_t entry) {
-        uint32_t node = 0;
-        while (nodes[node].dim != leaf && !unbalanced(node)) {
-            const auto [low, plane_dim, split, n] = nodes[node];
+    // The nodes from the root to the leaf to which an entry belongs.
+    std::vector<uint32_t> path_to(const Points& points, uint32_t entry) const {
+        std::vector<uint32_t> path = {0};
+        path.reserve(longest_path + 1);
+        while (nodes[path.back()].dim != leaf) {
+            const auto [child, plane_dim, split, number] = nodes[path.back()];
             const float x = points.rows[entry * dim + plane_dim];
-            ++nodes[node].count;
-            node = low + (x == split ? nodes[low + 1].count < nodes[low].count : x > split);
+            path.push_back(child + (x == split ? entry >= number : x > split));
         }
-        if (nodes[node].dim == leaf && nodes[node].count < lanes) return put(points, node, entry);
-        rebuild(points, node, {{0.0f, entry}});
+        return path;
+    }
+
+    // Where an overfull leaf lies too deep for the size of the tree, the lowest node above it that it also lies too
+    // deep for is built anew: that node is too small for its height, while its child, of height one less, is not.
+    void insert(const Points& points, uint32_t entry) {
+        const std::vector<uint32_t> path = path_to(points, entry);
+        const size_t depth = path.size() - 1;
+        Node& node = nodes[path[depth]];
+        ++size;
+        if (node.number < lanes) return put(points, node, entry);
+        const auto too_small = [](size_t n, size_t height) {
+            return double(n) < lanes * std::pow(1.5, double(height));
+        };
+        std::vector<uint32_t> order = {entry};
+        collect(path[depth], order);
+        size_t height = 0;
+        if (too_small(size, depth))
+            for (; !too_small(order.size(), height); ++height) {
+                collect(path[depth - height] ^ 1, order);
+                free_pairs.push_back(path[depth - height] / 2);
+            }
+        uint32_t lowest = path[depth - height];
+        while (nodes[lowest].dim != leaf) lowest = nodes[lowest].child;
+        build_node(points, path[depth - height], nodes[lowest].child, order);
+        build_if_sparse(points);
     }
 
     void remove(const Points& points, uint32_t entry) {
-        uint32_t node = home[entry], highest = no_entry;  // the highest unbalanced node
-        const uint32_t place = nodes[node].child, last = --nodes[node].count;
+        Node& node = nodes[path_to(points, entry).back()];
+        const uint32_t place = node.child, last = --node.number;
         const auto lane = std::find(entries[place].begin(), entries[place].end(), entry) - entries[place].begin();
         entries[place][lane] = entries[place][last];
         for (size_t d = 0; d < dim; ++d) coordinates[place * dim + d][lane] = coordinates[place * dim + d][last];
-        while (node != 0) {
-            node = parents[node / 2];
-            --nodes[node].count;
-            if (unbalanced(node)) highest = node;
-        }
-        if (highest != no_entry) rebuild(points, highest, {});
+        --size;
+        build_if_sparse(points);
     }
 
-    // Builds a node anew, from the entries below it and those in `order`.
-    void rebuild(const Points& points, uint32_t node, std::vector<Ranked> order) {
-        const uint32_t place = take_apart(node, order);
-        build_node(points, node, place, order);
+    void build_if_sparse(const Points& points) {
+        if (4 * (entries.size() - free_pairs.size()) <= size + lanes) return;
+        std::vector<uint32_t> order;
+        collect(0, order);
+        build(points, dim, std::move(order));
     }
 
-    // Appends the entries below a node to `order` and frees the pairs below. Returns the place that the node was given.
-    uint32_t take_apart(uint32_t node, std::vector<Ranked>& order) {
-        const auto [child, plane_dim, split, n] = nodes[node];
+    // Appends the entries below a node to `order` and frees the pairs below.
+    void collect(uint32_t node, std::vector<uint32_t>& order) {
+        const auto [child, plane_dim, split, number] = nodes[node];
         if (plane_dim == leaf) {
-            for (uint32_t i = 0; i < n; ++i) order.push_back({0.0f, entries[child][i]});
-            return child;
+            order.insert(order.end(), &entries[child][0], &entries[child][0] + number);
+        } else {
+            free_pairs.push_back(child / 2);
+            collect(child, order);
+            collect(child + 1, order);
         }
-        free_pairs.push_back(child / 2);
-        const uint32_t place = take_apart(child, order);
-        take_apart(child + 1, order);
-        return place;
     }
+};
 
-    struct Walk {              // a query on its way through the tree
-        size_t query;          // its number
-        float reach;           // an entry farther away cannot be a neighbour
-        uint32_t node = 0;     // to be visited next
-        bool fetched = false;  // `node` is a leaf that has been prefetched
-        size_t waiting = 0;
-        std::array<Ranked, longest_path> subtrees = {};  // [waiting] passed by: (squared distance to the plane, node)
-    };
-
-    // K(s_q) of the queries `at` [query, dim], but only of entries nearer than `limit`. Sixteen walks take one step each
-    // in turn, so that the next node of a walk can come from memory while the others compute.
-    EACH_TARGET void search(const Points& points, const float* at, const uint32_t* skipped, float limit,
-                            Neighbourhoods& found) const {
-        std::vector<Walk> walks;
-        for (size_t i = 0; i < std::min<size_t>(found.size(), 16); ++i) walks.push_back({i, limit});
-        for (size_t left = found.size(), begun = walks.size(); left > 0;)
-            for (Walk& walk : walks) {
-                if (walk.query >= found.size() || step(points, at, skipped, walk, found)) continue;
-                walk.query = begun++;
-                walk.reach = limit;
-                walk.node = 0;
-                --left;
-            }
-    }
+// A query on its way through a tree.
+struct Walk {
+    size_t query;          // its number
+    const float* point;    // [dim]
+    uint32_t skipped;      // the entry that is no neighbour
+    float reach;           // an entry farther away is none either
+    uint32_t fetched = 0;  // the leaf that has been prefetched, plus 1
+    size_t waiting = 1;    // subtrees to be visited, the last one first: (squared distance to its plane, node)
+    std::array<std::pair<float, uint32_t>, KdTree::longest_path + 1> subtrees = {};
 
     // Visits one node; returns whether there is another to visit. A subtree beyond a plane can be left out if the plane
     // is too far: a point beyond has a coordinate at least that far, and rounding, being monotone, keeps that order in
-    // the difference, in its square and in a sum of squares. At equal distances the older entry wins: hence <=.
-    [[gnu::always_inline]] inline bool step(const Points& points, const float* at, const uint32_t* skipped, Walk& walk,
-                                            Neighbourhoods& found) const {
-        const Node& node = nodes[walk.node];
-        if (node.dim != leaf) {
-            const float gap = at[walk.query * dim + node.dim] - node.split;
-            walk.node = gap > 0.0f ? node.child + 1 : node.child;
-            __builtin_prefetch(&nodes[walk.node]);
-            if (gap * gap <= walk.reach) walk.subtrees[walk.waiting++] = {gap * gap, walk.node ^ 1};
-            return true;
+    // the difference, in its square and in a sum of squares. At equal distances the older entry wins: hence not >=.
+    [[gnu::always_inline]] inline bool step(const KdTree& tree, const Points& points, Neighbourhoods& found) {
+        const uint32_t index = subtrees[waiting - 1].second;
+        const KdTree::Node& node = tree.nodes[index];
+        if (node.dim != KdTree::leaf) {
+            const float gap = point[node.dim] - node.split;
+            const uint32_t near = node.child + (gap > 0.0f);
+            __builtin_prefetch(&tree.nodes[near]);
+            subtrees[waiting - 1] = {gap * gap, near ^ 1};
+            subtrees[waiting++] = {0.0f, near};
+        } else if (fetched != index + 1) {
+            for (size_t d = 0; d < tree.dim; ++d) __builtin_prefetch(&tree.coordinates[node.child * tree.dim + d]);
+            __builtin_prefetch(&tree.entries[node.child]);
+            fetched = index + 1;
+        } else {
+            scan(tree, node, points, found);
+            --waiting;
+            while (waiting > 0 && subtrees[waiting - 1].first > reach) --waiting;
         }
-        if (!walk.fetched) {
-            for (size_t d = 0; d < dim; ++d) __builtin_prefetch(&coordinates[node.child * dim + d]);
-            __builtin_prefetch(&entries[node.child]);
-            return walk.fetched = true;
-        }
-        scan(points, at + walk.query * dim, skipped[walk.query], node, walk, found);
-        walk.fetched = false;
-        while (walk.waiting > 0) {
-            const auto [distance, subtree] = walk.subtrees[--walk.waiting];
-            walk.node = subtree;
-            if (distance <= walk.reach) return true;
-        }
-        return false;
+        return waiting > 0;
     }
 
     // Takes those entries of a leaf that are among the K nearest so far.
-    [[gnu::always_inline]] inline void scan(const Points& points, const float* point, uint32_t skipped,
-                                            const Node& node, Walk& walk, Neighbourhoods& found) const {
-        Lanes<float> distance = {};
-        for (size_t d = 0; d < dim; ++d)
+    [[gnu::always_inline]] inline void scan(const KdTree& tree, const KdTree::Node& node, const Points& points,
+                                            Neighbourhoods& found) {
+        KdTree::Lanes<float> distance = {};
+        for (size_t d = 0; d < tree.dim; ++d)
 #pragma GCC unroll 1  // vectors of lanes, not of dimensions
-            for (size_t i = 0; i < lanes; ++i) {
-                const float gap = coordinates[node.child * dim + d][i] - point[d];
+            for (size_t i = 0; i < KdTree::lanes; ++i) {
+                const float gap = tree.coordinates[node.child * tree.dim + d][i] - point[d];
                 distance[i] += gap * gap;
             }
-        Neighbour* best = &found.rows[walk.query * found.K];
-        size_t& count = found.counts[walk.query];
-        for (size_t i = 0; i < node.count; ++i) {
-            const Neighbour next = {distance[i], entries[node.child][i]};
-            if (!(next.distance <= walk.reach) || next.entry == skipped) continue;
-            if (count < found.K ? next.distance == walk.reach : !points.closer(next, best[count - 1])) continue;
+        Neighbour* best = &found.rows[query * found.K];
+        size_t& count = found.counts[query];
+        for (size_t i = 0; i < node.number; ++i) {
+            const Neighbour next = {distance[i], tree.entries[node.child][i]};
+            if (!(next.distance <= reach) || next.entry == skipped) continue;
+            if (count == found.K && !points.closer(next, best[count - 1])) continue;
             size_t k = count < found.K ? count++ : count - 1;
             for (; k > 0 && points.closer(next, best[k - 1]); --k) best[k] = best[k - 1];
             best[k] = next;
-            if (count == found.K) walk.reach = best[count - 1].distance;
+            if (count == found.K) reach = best[count - 1].distance;
         }
     }
 };
@@ -512,6 +559,9 @@ struct EpisodicMemory {
     struct HeapItem {
         uint64_t priority, age;
         uint32_t entry;
+        bool operator>(const HeapItem& b) const {
+            return priority > b.priority || (priority == b.priority && age > b.age);
+        }
     };
 
     MemoryConfig config;
@@ -530,14 +580,16 @@ struct EpisodicMemory {
 
     // Derived: never saved, rebuilt by rebuild_derived().
     std::vector<uint32_t> slots;  // hash table of entries: open addressing, linear probing, a power of two long
-    std::vector<HeapItem> heap;   // empty until the first eviction, then one item per entry
-    KdTree tree;                  // over `projected`
+    // One item per entry, the smallest on top; empty until the first eviction.
+    std::priority_queue<HeapItem, std::vector<HeapItem>, std::greater<>> heap;
+    KdTree tree;  // over `projected`
 
     EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
         : config(settings),
-          S(static_cast<size_t>(config.state_dim)),
-          A(static_cast<size_t>(config.action_dim)),
-          dim(config.projected_dim > 0 ? static_cast<size_t>(config.projected_dim) : S) {
+          S(config.state_dim),
+          A(config.action_dim),
+          dim(config.projected_dim) {
+        if (dim == 0) dim = S;
         if (config.state_dim < 1 || config.action_dim < 1 || config.projected_dim < 0 || config.K < 1 ||
             config.capacity < 1 || config.capacity > 0x7FFFFFFF || !(config.epsilon >= 0.0) || !(config.tau > 0.0))
             fail("memory.config",
@@ -549,9 +601,9 @@ struct EpisodicMemory {
         // distance, so that epsilon means the same before and after.
         const Random random{seed, Stream::projection};
         const double scale = 1.0 / std::sqrt(static_cast<double>(dim));
-        projection.resize(static_cast<size_t>(config.projected_dim) * S);
-        for (size_t i = 0; i < projection.size(); ++i)
-            projection[i] = scale * random.normal(0, static_cast<uint32_t>(i));
+        projection.resize(config.projected_dim * S);
+        for (uint32_t i = 0; i < projection.size(); ++i) projection[i] = scale * random.normal(0, i);
+        for_each_column(*this, [&](auto, auto& column, size_t width) { column.reserve(config.capacity * width); });
         rebuild_derived();
     }
 
@@ -562,12 +614,9 @@ struct EpisodicMemory {
     // Every state of a relabelled trajectory, in the order of time.
     Changes update(const Trajectory& trajectory) {
         const size_t T = trajectory.rewards.size();
-        check_size("states", trajectory.states.size(), T, S);
-        check_size("actions", trajectory.actions.size(), T, A);
-        check_size("discounted returns", trajectory.discounted_returns.size(), T, 1);
-        check_finite("states", trajectory.states.data(), T * S);
-        check_finite("actions", trajectory.actions.data(), T * A);
-        check_finite("discounted returns", trajectory.discounted_returns.data(), T);
+        check_column("states", trajectory.states, T, S);
+        check_column("actions", trajectory.actions, T, A);
+        check_column("discounted returns", trajectory.discounted_returns, T, 1);
         Changes changes;
         std::vector<Words4> key(T);
         for (size_t t = 0; t < T; ++t) {
@@ -595,7 +644,7 @@ struct EpisodicMemory {
         if (e[entry] < d) {
             ++changes.improved;
             e[entry] = d;
-            set_row(actions, entry, action, A);
+            std::copy_n(action, A, &actions[entry * A]);
         } else {  // equal returns keep the older action
             ++changes.kept;
         }
@@ -603,39 +652,22 @@ struct EpisodicMemory {
 
     void insert(const Words4& key, const float* point, const float* action, double d) {
         const bool full = size() == config.capacity;
-        const uint32_t entry = full ? evict() : append();
-        set_row(keys, entry, key.data(), 4);
-        set_row(projected, entry, point, dim);
-        set_row(actions, entry, action, A);
+        const uint32_t entry = full ? evict() : static_cast<uint32_t>(size());
+        if (!full)
+            for_each_column(*this, [](auto, auto& column, size_t width) { column.resize(column.size() + width); });
+        std::copy_n(key.data(), 4, &keys[size_t{entry} * 4]);
+        std::copy_n(point, dim, &projected[entry * dim]);
+        std::copy_n(action, A, &actions[entry * A]);
         e[entry] = d;
         age[entry] = insertions++;
         priority[entry] = 0;
         count_access(entry);
         slots[find_slot(key)] = entry;
         tree.insert(points(), entry);
-        if (full) {
-            heap.push_back({priority[entry], age[entry], entry});
-            std::push_heap(heap.begin(), heap.end(), later);
-        }
+        if (full) heap.push(heap_item(entry));
     }
 
     Points points() const { return {projected.data(), age.data()}; }
-
-    template <class Number>
-    static void set_row(std::vector<Number>& column, size_t entry, const Number* row, size_t width) {
-        std::copy_n(row, width, column.begin() + static_cast<std::ptrdiff_t>(entry * width));
-    }
-
-    // One more row in every column. Room doubles, but never beyond the table's capacity.
-    uint32_t append() {
-        const size_t n = size(), room = std::min(config.capacity, std::max<size_t>(16, 2 * n));
-        const bool grow = n == e.capacity();
-        for_each_column(*this, [&](const char*, auto& column, size_t width) {
-            if (grow) column.reserve(room * width);
-            column.resize((n + 1) * width);
-        });
-        return static_cast<uint32_t>(n);
-    }
 
     // An access: an insertion, an exact hit in update(), a neighbour that passed epsilon in a look-up.
     void count_access(uint32_t entry) {
@@ -643,9 +675,7 @@ struct EpisodicMemory {
         priority[entry] = config.eviction == Eviction::lfu ? priority[entry] + 1 : accesses;
     }
 
-    static bool later(const HeapItem& a, const HeapItem& b) {
-        return a.priority > b.priority || (a.priority == b.priority && a.age > b.age);
-    }
+    HeapItem heap_item(uint32_t entry) const { return {priority[entry], age[entry], entry}; }
 
     // WODTEM sec. IV-B.1, full table: "When Q is filled, we remove the least frequently accessed entry"; ties: the
     // oldest.
@@ -653,19 +683,13 @@ struct EpisodicMemory {
     // what it has now. So when the smallest item proves up to date, no entry can be below it; when it does not, it goes
     // back with its present priority. Each access makes at most one item stale: amortised, one push per access.
     uint32_t evict() {
-        if (heap.empty()) {
-            heap.reserve(size());
-            for (uint32_t i = 0; i < size(); ++i) heap.push_back({priority[i], age[i], i});
-            std::make_heap(heap.begin(), heap.end(), later);
+        for (uint32_t i = 0; heap.size() < size(); ++i) heap.push(heap_item(i));
+        uint32_t entry = heap.top().entry;
+        for (; heap.top().priority != priority[entry]; entry = heap.top().entry) {
+            heap.pop();
+            heap.push(heap_item(entry));
         }
-        while (heap.front().priority != priority[heap.front().entry]) {
-            std::pop_heap(heap.begin(), heap.end(), later);
-            heap.back().priority = priority[heap.back().entry];
-            std::push_heap(heap.begin(), heap.end(), later);
-        }
-        std::pop_heap(heap.begin(), heap.end(), later);
-        const uint32_t entry = heap.back().entry;
-        heap.pop_back();
+        heap.pop();
         empty_slot(find_slot(key_of(entry)));
         tree.remove(points(), entry);
         return entry;
@@ -711,28 +735,25 @@ struct EpisodicMemory {
         for (size_t d = 0; d < dim; ++d) point[d] += 0.0f;  // -0 becomes +0
     }
 
-    // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for a
-    // projected s_q; `skipped` is passed over. Specification:
-    std::vector<Neighbour> nearest_plain(const float* point, uint32_t skipped) const {
-        std::vector<Neighbour> found;
-        for (uint32_t i = 0; i < size(); ++i) {
-            const float distance = squared_distance(&projected[i * dim], point, dim);
-            if (i != skipped && distance < config.epsilon) found.push_back({distance, i});
-        }
-        std::sort(found.begin(), found.end(), [&](auto& a, auto& b) { return points().closer(a, b); });
-        found.resize(std::min(found.size(), static_cast<size_t>(config.K)));
-        return found;
-    }
-
-    // The same from the tree, for many projected states `at` [n, dim] and the entries skipped [n] at once.
-    Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped) const {
-        Neighbourhoods found{static_cast<size_t>(config.K), {}, {}};
-        found.rows.resize(skipped.size() * found.K);
-        found.counts.resize(skipped.size());
-        // The smallest float that is not below epsilon: the same floats are below both.
+    // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for
+    // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. Sixteen walks take one step
+    // each in turn, so that the next node of a walk can come from memory while the others compute.
+    EACH_TARGET Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped) const {
+        const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
+        Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
+        // The largest float below epsilon.
         float limit = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
-        if (limit < config.epsilon) limit = std::nextafter(limit, INFINITY);
-        tree.search(points(), at.data(), skipped.data(), limit, found);
+        if (limit >= config.epsilon) limit = std::nextafter(limit, -INFINITY);
+        std::vector<Walk> walks;
+        for (size_t begun = 0; begun < n || !walks.empty();) {
+            for (; begun < n && walks.size() < 16; ++begun)
+                walks.push_back({begun, &at[begun * dim], skipped[begun], limit});
+            for (size_t i = walks.size(); i-- > 0;) {
+                if (walks[i].step(tree, points(), found)) continue;
+                walks[i] = walks.back();
+                walks.pop_back();
+            }
+        }
         return found;
     }
 
@@ -754,28 +775,17 @@ struct EpisodicMemory {
 
     // ---- eqs. (5) to (7). `found` is K(s_q).
 
-    // exp(-q_k) / exp(-q_1), where q_1 is the smallest distance: the quotient in eq. (5) is the same, and no distance can
-    // make it 0 / 0. The float exp is used, because the bits of libm's double exp depend on the processor.
+    // exp(-q_k) / exp(-q_1), where q_1 is the smallest distance: the quotient in eq. (5) is the same, and no distance
+    // can make it 0 / 0. The float exp is used, because the bits of libm's double exp depend on the processor.
     static double similarity(std::span<const Neighbour> found, size_t k) {
         return std::exp(found[0].distance - found[k].distance);
     }
 
-    // e-hat(s_q) of eq. (5) as it is written, for the golden vectors and the tests; training compares by is_optimal().
-    // Returns NaN, that is unknown, for an empty K(s_q).
-    double approximate_return(std::span<const Neighbour> found) const {
-        double sum = 0.0, normaliser = 0.0;
-        for (size_t k = 0; k < found.size(); ++k) {
-            sum += similarity(found, k) * e[found[k].entry];
-            normaliser += similarity(found, k);
-        }
-        return sum / normaliser;
-    }
-
     // WODTEM eq. (5): e-hat(s_q) = sum_k p_k e_k, p_k = exp(-q(s_q, s_k)) / sum_k1 exp(-q(s_q, s_k1)).
     // Returns whether d >= e-hat(s_q), that is whether a_c is "the historical optimal action". The p_k sum to 1, so the
-    // comparison is sum_k exp(-q_k) (e_k - d) <= 0. This form is exact where it matters: if all e_k equal d, each term is
-    // 0, whereas a rounded mean of equal numbers can exceed them and would give such a pair the weight alpha. Without
-    // neighbours the sum is empty and the answer yes: nothing speaks against a_c.
+    // comparison is sum_k exp(-q_k) (e_k - d) <= 0. This form is exact where it matters: if all e_k equal d, each term
+    // is 0, whereas a rounded mean of equal numbers can exceed them and would give such a pair the weight alpha.
+    // Without neighbours the sum is empty and the answer yes: nothing speaks against a_c.
     bool is_optimal(std::span<const Neighbour> found, double d) const {
         double excess = 0.0;
         for (size_t k = 0; k < found.size(); ++k) excess += similarity(found, k) * (e[found[k].entry] - d);
@@ -786,29 +796,26 @@ struct EpisodicMemory {
     static double weight(bool optimal, double alpha) { return optimal ? 1.0 : alpha; }
 
     // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
-    // The largest e is subtracted first: e reaches thousands and exp(89) overflows a float. `uniform` lies in [0, 1); the
-    // neighbour is drawn by the inverse of the cumulative distribution. Returns the action [action_dim].
+    // The largest e is subtracted first: e reaches thousands and exp(89) overflows a float. `uniform` lies in [0, 1);
+    // the neighbour is drawn by the inverse of the cumulative distribution. Returns the action [action_dim].
     const float* advised_action(std::span<const Neighbour> found, double uniform) const {
         if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to advise");
-        double best = e[found[0].entry], total = 0.0, cumulative = 0.0;
+        double best = e[found[0].entry], total = 0.0;
         for (const Neighbour& neighbour : found) best = std::max(best, e[neighbour.entry]);
-        const auto odds = [&](const Neighbour& neighbour) {
-            return double{std::exp(static_cast<float>((e[neighbour.entry] - best) / config.tau))};
-        };
-        for (const Neighbour& neighbour : found) total += odds(neighbour);
-        // uniform <= 1 - 2^-53 makes uniform * total < total even when rounded, and the cumulative sum ends in total. So
-        // one neighbour is drawn, and never one of probability 0, which leaves the sum unchanged.
-        size_t k = 0;
-        for (; k + 1 < found.size(); ++k) {
-            cumulative += odds(found[k]);
-            if (cumulative > uniform * total) break;
+        std::vector<double> cumulative;
+        for (const Neighbour& neighbour : found) {
+            total += double{std::exp(static_cast<float>((e[neighbour.entry] - best) / config.tau))};
+            cumulative.push_back(total);
         }
-        return &actions[found[k].entry * A];
+        // uniform <= 1 - 2^-53 makes uniform * total < total even when rounded. So one neighbour is drawn, and never
+        // one of probability 0, which leaves the sum unchanged.
+        const auto drawn = std::upper_bound(cumulative.begin(), cumulative.end(), uniform * total);
+        return &actions[found[drawn - cumulative.begin()].entry * A];
     }
 
-    // ---- saving and loading
+    // ---- columns
 
-    // each(name, column, numbers per entry)
+    // Calls each(name, column, numbers per entry) for every column of the table.
     template <class Self, class Each>
     static void for_each_column(Self& self, const Each& each) {
         each("memory.keys", self.keys, size_t{4});
@@ -819,43 +826,40 @@ struct EpisodicMemory {
         each("memory.age", self.age, size_t{1});
     }
 
-    template <class Archive>
-    void visit(Archive& archive) {
-        for_each_column(*this, [&](const char* name, auto& column, size_t) { archive(name, column); });
-        archive("memory.projection", projection);
-        archive("memory.accesses", accesses);
-        archive("memory.insertions", insertions);
-        if (archive.loading) rebuild_derived();
-    }
-
-    // Everything that is not saved, from what is; refuses what no run can have saved.
+    // Derives from the columns what is not stored in them. The columns must fit together and no key may repeat.
     void rebuild_derived() {
-        const auto require = [](bool holds, const char* name, const char* what) {
-            if (!holds) fail("checkpoint.memory", "the episodic memory does not fit together: %s %s", name, what);
-        };
-        const size_t n = size();
-        require(n <= config.capacity, "memory.e", "has more entries than the table may hold");
-        for_each_column(*this, [&](const char* name, const auto& column, size_t width) {
-            require(column.size() == n * width, name, "has a wrong number of values");
-            for (const auto value : column)
-                require(std::isfinite(static_cast<double>(value)), name, "holds a number that is not finite");
-        });
-        const size_t cells = static_cast<size_t>(config.projected_dim) * S;
-        require(projection.size() == cells, "memory.projection", "has a wrong number of values");
-        for (const double value : projection) require(std::isfinite(value), "memory.projection", "is not finite");
-        std::vector<uint64_t> ages = age;
-        std::sort(ages.begin(), ages.end());
-        require(std::adjacent_find(ages.begin(), ages.end()) == ages.end(), "memory.age", "repeats itself");
-        require(n == 0 || ages.back() < insertions, "memory.age", "exceeds memory.insertions");
-        for (const uint64_t value : priority)
-            require(value >= 1 && value <= accesses, "memory.priority", "lies outside 1 .. memory.accesses");
+        const uint32_t n = static_cast<uint32_t>(size());
         slots.assign(std::bit_ceil(config.capacity + config.capacity / 2 + 1), no_entry);  // load at most 2/3
-        for (uint32_t i = 0; i < n; ++i) {
-            uint32_t& slot = slots[find_slot(key_of(i))];
-            require(slot == no_entry, "memory.keys", "holds a key twice");
-            slot = i;
-        }
-        heap.clear();
-        tree.build(points(), dim, static_cast<uint32_t>(n));
+        for (uint32_t i = 0; i < n; ++i) slots[find_slot(key_of(i))] = i;
+        heap = {};
+        std::vector<uint32_t> all(n);
+        std::iota(all.begin(), all.end(), 0u);
+        tree.build(points(), dim, std::move(all));
     }
 };
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The look-up and eq. (5) as the paper writes them. The tests hold nearest() and is_optimal() to these two.
+
+// K(s_q) of a projected s_q [dim] by a scan of all entries; `skipped` is passed over.
+inline std::vector<Neighbour> nearest_plain(const EpisodicMemory& memory, const float* point, uint32_t skipped) {
+    std::vector<Neighbour> found;
+    for (uint32_t i = 0; i < memory.size(); ++i) {
+        const float distance = squared_distance(&memory.projected[i * memory.dim], point, memory.dim);
+        if (i != skipped && distance < memory.config.epsilon) found.push_back({distance, i});
+    }
+    std::sort(found.begin(), found.end(), [&](auto& a, auto& b) { return memory.points().closer(a, b); });
+    found.resize(std::min(found.size(), static_cast<size_t>(memory.config.K)));
+    return found;
+}
+
+// e-hat(s_q) = sum_k p_k e_k of eq. (5), of K(s_q); NaN, that is unknown, for an empty one. Training compares by
+// is_optimal(), which does not form it.
+inline double approximate_return(const EpisodicMemory& memory, std::span<const Neighbour> found) {
+    double sum = 0.0, normaliser = 0.0;
+    for (size_t k = 0; k < found.size(); ++k) {
+        sum += memory.similarity(found, k) * memory.e[found[k].entry];
+        normaliser += memory.similarity(found, k);
+    }
+    return sum / normaliser;
+}

@@ -1,13 +1,13 @@
 // mujoco_env.hpp: the nine MuJoCo tasks of the paper: hopper, walker2d, halfcheetah, ant (gym -v2), maze2d (-v1) and
 // antmaze (-v2), WODTEM sec. V-A. One table of tasks, then models, reset, step, observation, reward and termination,
-// written once, in the shape that gridworld.hpp gives every environment.
+// written once, as an Environment of memory.hpp.
 //
 // The models are data/*.xml, held in the binary; the mazes are made from their cell maps below. Lengths are in metres,
 // times in seconds, angles in radians, and qpos and qvel are MuJoCo's vectors of positions and velocities.
 // Promises: the numbers of the environments that D4RL's data and scores belong to, in either physics; an episode is a
-// function of (seed, episode, actions, machine); what the engine warns of is an error, never data.
-// Leaves out: the time limit, which the caller of step() counts; data sets; returns (memory.hpp); networks.
-// Needs MuJoCo 2.2 (Debian: libmujoco-dev); without it the table remains, and WODTEM_MUJOCO is not defined.
+// function of (seed, episode, actions, machine); a step that the engine warns of is an error, never data.
+// Leaves out: the time limit, which play() counts; data sets; returns (memory.hpp); networks.
+// Needs MuJoCo 2.2 (Debian: libmujoco-dev). Without it the table of tasks remains, and WODTEM_MUJOCO is not defined.
 #pragma once
 
 #include <algorithm>
@@ -23,7 +23,7 @@
 #include <string_view>
 #include <vector>
 
-#include "gridworld.hpp"
+#include "memory.hpp"
 #include "nn.hpp"
 
 #if __has_include(<mujoco/mujoco.h>) && !defined(WODTEM_WITHOUT_MUJOCO)
@@ -93,8 +93,7 @@ constexpr double no_limit = std::numeric_limits<double>::infinity();
 struct MujocoTask {
     const char *name, *version;  // together the id: hopper-v2; D4RL's data sets put their level between the two
     Rules rules;
-    const char* model;  // data/MODEL.xml; maze2d's is written by maze2d_model()
-    const char* maze;   // map, or null
+    const char* maze;  // map, or null
     int state_dim, action_dim;
     int first_position;     // the observation is qpos from here on, then qvel, then for ant the contact forces
     double velocity_limit;  // observed velocities are clipped to +- this
@@ -108,18 +107,16 @@ struct MujocoTask {
 
 // Sources: gym 0.18.0's -v2 classes, D4RL's pointmaze and locomotion; reference returns: D4RL's infos.
 constexpr std::array<MujocoTask, 9> mujoco_tasks{{
-    {"hopper", "-v2", Rules::hopper, "hopper", nullptr, 11, 3, 1, 10, 4, 1000, 0.001, 0.005, false, -20.272305, 3234.3},
-    {"walker2d", "-v2", Rules::walker2d, "walker2d", nullptr, 17, 6, 1, 10, 4, 1000, 0.001, 0.005, false, 1.629008,
-     4592.3},
-    {"halfcheetah", "-v2", Rules::halfcheetah, "halfcheetah", nullptr, 17, 6, 1, no_limit, 5, 1000, 0.1, 0.1, true,
-     -280.178953, 12135.0},
-    {"ant", "-v2", Rules::ant, "ant", nullptr, 111, 8, 2, no_limit, 5, 1000, 0.5, 0.1, true, -325.6, 3879.7},
-    {"maze2d-umaze", "-v1", Rules::maze2d, "", umaze_map, 4, 2, 0, no_limit, 1, 300, 0, 0.1, true, 23.85, 161.86},
-    {"maze2d-medium", "-v1", Rules::maze2d, "", medium_map, 4, 2, 0, no_limit, 1, 600, 0, 0.1, true, 13.13, 277.39},
-    {"maze2d-large", "-v1", Rules::maze2d, "", large_map, 4, 2, 0, no_limit, 1, 800, 0, 0.1, true, 6.7, 273.99},
-    {"antmaze-umaze", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0, 1},
-    {"antmaze-umaze-diverse", "-v2", Rules::antmaze, "ant", ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0,
-     1},
+    {"hopper", "-v2", Rules::hopper, nullptr, 11, 3, 1, 10, 4, 1000, 0.001, 0.005, false, -20.272305, 3234.3},
+    {"walker2d", "-v2", Rules::walker2d, nullptr, 17, 6, 1, 10, 4, 1000, 0.001, 0.005, false, 1.629008, 4592.3},
+    {"halfcheetah", "-v2", Rules::halfcheetah, nullptr, 17, 6, 1, no_limit, 5, 1000, 0.1, 0.1, true, -280.178953,
+     12135.0},
+    {"ant", "-v2", Rules::ant, nullptr, 111, 8, 2, no_limit, 5, 1000, 0.5, 0.1, true, -325.6, 3879.7},
+    {"maze2d-umaze", "-v1", Rules::maze2d, umaze_map, 4, 2, 0, no_limit, 1, 300, 0, 0.1, true, 23.85, 161.86},
+    {"maze2d-medium", "-v1", Rules::maze2d, medium_map, 4, 2, 0, no_limit, 1, 600, 0, 0.1, true, 13.13, 277.39},
+    {"maze2d-large", "-v1", Rules::maze2d, large_map, 4, 2, 0, no_limit, 1, 800, 0, 0.1, true, 6.7, 273.99},
+    {"antmaze-umaze", "-v2", Rules::antmaze, ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0, 1},
+    {"antmaze-umaze-diverse", "-v2", Rules::antmaze, ant_umaze_map, 29, 8, 0, no_limit, 5, 700, 0, 0.1, true, 0, 1},
 }};
 
 // The task that an id such as "hopper", "hopper-v2" or "hopper-medium-replay-v2" belongs to, or null.
@@ -160,31 +157,28 @@ constexpr std::array<const char*, 2> physics_names{"d4rl", "2.2"};
 constexpr const char* mujoco_advice = "apt-get install libmujoco-dev, then make clean and make";
 
 #ifndef WODTEM_MUJOCO
-
 inline std::string mujoco_version() { return "none"; }
-
 #else
-
 inline std::string mujoco_version() { return mj_versionString(); }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Models.
 
-// The bytes of a file as it was when this was compiled, zero at the end; the path is the compiler's.
-#define WODTEM_EMBED(name, path)                                                          \
-    asm(".pushsection .rodata\n" #name ": .incbin \"" path "\"\n.byte 0\n.popsection\n"); \
-    extern "C" const char name[];
+// Holds the bytes of a file in the binary: [name, name_end), followed by a zero. The compiler opens the path, from the
+// folder it runs in.
+#define WODTEM_EMBED(name, path)                                                                         \
+    asm(".pushsection .rodata\n" #name ": .incbin \"" path "\"\n" #name "_end: .byte 0\n.popsection\n"); \
+    extern "C" const char name[], name##_end[];
 WODTEM_EMBED(wodtem_hopper_xml, "data/hopper.xml")
 WODTEM_EMBED(wodtem_walker2d_xml, "data/walker2d.xml")
 WODTEM_EMBED(wodtem_halfcheetah_xml, "data/halfcheetah.xml")
 WODTEM_EMBED(wodtem_ant_xml, "data/ant.xml")
-#undef WODTEM_EMBED
 
-inline const char* embedded_model(std::string_view name) {
-    if (name == "hopper") return wodtem_hopper_xml;
-    if (name == "walker2d") return wodtem_walker2d_xml;
-    if (name == "halfcheetah") return wodtem_halfcheetah_xml;
-    return wodtem_ant_xml;
+// data/*.xml; of the mazes only antmaze, whose ant is gym's, has such a file.
+inline const char* embedded_model(Rules rules) {
+    if (rules == Rules::hopper) return wodtem_hopper_xml;
+    if (rules == Rules::walker2d) return wodtem_walker2d_xml;
+    return rules == Rules::halfcheetah ? wodtem_halfcheetah_xml : wodtem_ant_xml;
 }
 
 // A box for each wall of the map, in row-major order.
@@ -240,13 +234,15 @@ inline std::string task_model(const MujocoTask& task, Physics physics) {
     return xml + "</mujoco>";
 }
 
-// By itself the engine would wait for a key at an error, and print and log warnings, whose counters we read.
+// Makes the engine's errors exceptions, and keeps it from printing warnings, whose counters check_engine() reads.
+// The exception unwinds the engine's C functions, which C++ does not guarantee: it works where the library has unwind
+// tables, as on x86-64 Linux. Memory that they had allocated leaks, and the interrupted simulation needs a start().
 inline void silence_engine() {
     mju_user_error = [](const char* text) { fail("mujoco.engine", "MuJoCo: %s", text); };
     mju_user_warning = [](const char*) {};
 }
 
-// Errors: mujoco.version, mujoco.model.
+// Compiles the task's model. Errors: mujoco.version, mujoco.model, mujoco.engine.
 inline std::shared_ptr<const mjModel> load_model(const MujocoTask& task, Physics physics) {
     silence_engine();
     if (mj_version() != mjVERSION_HEADER)
@@ -259,7 +255,7 @@ inline std::shared_ptr<const mjModel> load_model(const MujocoTask& task, Physics
         std::memcpy(files->filedata[mj_findFileVFS(files.get(), name)], text.data(), text.size());
     };
     add_file("task.xml", task_model(task, physics));
-    add_file("model.xml", embedded_model(task.model));
+    add_file("model.xml", embedded_model(task.rules));
     char error[500] = "";
     mjModel* model = mj_loadXML("task.xml", files.get(), error, sizeof error);
     mj_deleteVFS(files.get());
@@ -267,50 +263,64 @@ inline std::shared_ptr<const mjModel> load_model(const MujocoTask& task, Physics
     return {model, [](const mjModel* m) { mj_deleteModel(const_cast<mjModel*>(m)); }};
 }
 
+using EngineState = std::unique_ptr<mjData, void (*)(mjData*)>;
+
+// Takes over a state that the engine has just allocated. Errors: mujoco.memory.
+inline EngineState own_state(mjData* data) {
+    if (!data) fail("mujoco.memory", "no memory for the state of a simulation; play fewer episodes at once");
+    return {data, mj_deleteData};
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // The environment.
 
-struct MujocoEnvironment {
+struct MujocoEnvironment : Environment {
     const MujocoTask* task;
     std::shared_ptr<const mjModel> model;
-    std::unique_ptr<mjData, void (*)(mjData*)> data;  // all that changes during an episode, but for the next three
-    std::array<double, 2> goal{};                     // observed x, y; mazes only
-    int steps = 0;                                    // since the reset
-    std::vector<double> observation;                  // [state_dim] the present one
-    std::vector<double> control;                      // [action_dim] scratch
+    EngineState data;                 // changes during an episode, as do the next three
+    std::array<double, 2> goal{};     // observed x, y; mazes only
+    int steps = 0;                    // since the reset
+    std::vector<double> observation;  // [state_dim] the present one
+    std::vector<double> control;      // [action_dim] the actuators', of the latest step
 
     MujocoEnvironment(const MujocoTask& t, Physics physics)
         : task(&t),
           model(load_model(t, physics)),
-          data(mj_makeData(model.get()), mj_deleteData) {
-        observation.resize(static_cast<size_t>(t.state_dim));
-        control.resize(static_cast<size_t>(t.action_dim));
+          data(own_state(mj_makeData(model.get()))),
+          observation(t.state_dim),
+          control(t.action_dim) {
         goal = default_goal();
-        start({model->qpos0, static_cast<size_t>(model->nq)}, std::vector<double>(static_cast<size_t>(model->nv)));
+        start({model->qpos0, static_cast<size_t>(model->nq)}, std::vector<double>(model->nv));
     }
     MujocoEnvironment(const MujocoEnvironment& other)
-        : task(other.task),
+        : Environment(),
+          task(other.task),
           model(other.model),
-          data(mj_copyData(nullptr, other.model.get(), other.data.get()), mj_deleteData),
+          data(own_state(mj_copyData(nullptr, other.model.get(), other.data.get()))),
           goal(other.goal),
           steps(other.steps),
           observation(other.observation),
           control(other.control) {}
-    MujocoEnvironment(MujocoEnvironment&&) = default;
-    MujocoEnvironment& operator=(MujocoEnvironment&&) = default;
 
-    EnvironmentSpec spec() const { return {task->state_dim, task->action_dim, 0, task->max_episode_steps}; }
+    EnvironmentSpec spec() const override { return {task->state_dim, task->action_dim, 0, task->max_episode_steps}; }
 
     // Begins an episode at a random state: a function of (random, episode). state [state_dim].
     // gym's and D4RL's distributions, in our own random numbers: draws are counted, qpos before qvel.
-    void reset(const Random& random, uint64_t episode, float* state) {
+    void reset(const Random& random, uint64_t episode, float* state) override {
         uint32_t draws = 0;
         const auto uniform = [&](double low, double high) {
             return low + (high - low) * random.uniform(episode, draws++);
         };
-        if (task->rules == Rules::antmaze) draw_goal(uniform);
+        if (task->rules == Rules::antmaze) {
+            // D4RL's antmaze-v2: the goal cell's centre, plus uniform [0, 1), plus uniform [0, 0.5), x before y each
+            // time, then raised to at least 0.
+            goal = default_goal();
+            for (const double range : {1.0, 0.5})
+                for (double& g : goal) g += uniform(0, range);
+            for (double& g : goal) g = std::max(g, 0.0);
+        }
         const double noise = task->reset_noise;
-        std::vector<double> qpos(model->qpos0, model->qpos0 + model->nq), qvel(static_cast<size_t>(model->nv));
+        std::vector<double> qpos(model->qpos0, model->qpos0 + model->nq), qvel(model->nv);
         if (task->rules == Rules::maze2d) {  // D4RL: a free cell, the goal's among them
             std::vector<MazeCell> cells = cells_marked(task->maze, '0');
             cells.push_back(cells_marked(task->maze, 'G')[0]);
@@ -329,43 +339,39 @@ struct MujocoEnvironment {
     void start(std::span<const double> qpos, std::span<const double> qvel) {
         mj_resetData(model.get(), data.get());  // also the controls, the time, the solver's warm start and the warnings
         steps = 0;
-        set_state(qpos, qvel);
+        std::copy(qpos.begin(), qpos.end(), data->qpos);
+        std::copy(qvel.begin(), qvel.end(), data->qvel);
+        // As in gym's set_state: normalises quaternions in qpos, places the bodies, leaves the next step's warm start.
+        mj_forward(model.get(), data.get());
         observe();
     }
 
-    // gym's set_state. mj_forward is part of it: it normalises quaternions in qpos, places the bodies, and leaves the
-    // warm start of the next step.
-    void set_state(std::span<const double> qpos, std::span<const double> qvel) {
-        std::copy(qpos.begin(), qpos.end(), data->qpos);
-        std::copy(qvel.begin(), qvel.end(), data->qvel);
-        mj_forward(model.get(), data.get());
-    }
-
-    // action [action_dim], state [state_dim]: where it led. May be called after termination; it means nothing then.
-    // Errors: mujoco.bad_action, mujoco.unstable; the episode is over then.
-    Step step(const float* action, float* state) {
+    // action [action_dim], state [state_dim]: the one that follows. Rewards after termination mean nothing.
+    // Errors: mujoco.bad_action, environment.unstable; the episode is over then.
+    Step step(const float* action, float* state) override {
         std::copy(action, action + task->action_dim, control.begin());
         const Step result = advance(control);
         std::copy(observation.begin(), observation.end(), state);
         return result;
     }
 
-    // The same in double precision: action [action_dim]; the new state is in `observation`.
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<MujocoEnvironment>(*this); }
+
+    // As step(), in double precision: action [action_dim]; the new state is in `observation`.
     Step advance(std::span<const double> action) {
         to_control(action);
         if (task->rules == Rules::maze2d) clip_velocity();
         const double x_before = x_position();
         std::copy(control.begin(), control.end(), data->ctrl);
         for (int i = 0; i < task->frame_skip; ++i) mj_step(model.get(), data.get());
-        // No mj_forward here: what is derived from qpos and qvel belongs to the integrator's last evaluation, as in gym.
+        // No mj_forward here: quantities derived from qpos and qvel are of the integrator's last evaluation, as in gym.
         ++steps;
         check_engine();
         observe();
         return {reward(x_before), terminated()};
     }
 
-    // ----- rules -----
-
+    // Of the step just made; x_before: x_position() before it.
     double reward(double x_before) const {
         if (task->maze) return distance_to_goal() <= goal_radius ? 1 : 0;  // D4RL's sparse reward
         double squares = 0;
@@ -400,7 +406,7 @@ struct MujocoEnvironment {
         return false;
     }
 
-    // Everything the policy sees: no goal, and of the mazes no walls.
+    // Writes `observation`, all that a policy sees: neither the goal nor the walls of a maze.
     void observe() {
         auto to = std::copy(data->qpos + task->first_position, data->qpos + model->nq, observation.begin());
         for (int i = 0; i < model->nv; ++i)
@@ -408,18 +414,15 @@ struct MujocoEnvironment {
         for (int i = 0; to != observation.end(); ++i) *to++ = std::clamp(data->cfrc_ext[i], -1.0, 1.0);
     }
 
-    // ----- parts -----
-
     double step_time() const { return model->opt.timestep * task->frame_skip; }  // seconds per action
-
-    // gym's ant takes the torso's place in the world, which after a Runge-Kutta step is that of the last stage; the
-    // others take qpos.
+    // gym's ant takes the torso's position in the world, which after a Runge-Kutta step is that of the last stage; the
+    // other tasks take qpos.
     double x_position() const { return task->rules == Rules::ant ? data->xpos[3] : data->qpos[0]; }
 
     double distance_to_goal() const { return std::hypot(data->qpos[0] - goal[0], data->qpos[1] - goal[1]); }
 
-    // Always 0: mj_step fills cfrc_ext [bodies x 6] only for sensors, of which the model has none, and neither gym nor
-    // D4RL's collection asked for it.
+    // Always 0: mj_step computes cfrc_ext [bodies x 6] only for sensors, which the model does not have, and neither gym
+    // nor D4RL's collection computed it.
     double squared_contact_forces() const {
         double sum = 0;
         for (int i = 0; i < 6 * model->nbody; ++i) {
@@ -435,8 +438,8 @@ struct MujocoEnvironment {
                std::all_of(data->qvel, data->qvel + model->nv, finite);
     }
 
-    // From an action in [-1, 1] to the actuators' range. D4RL's wrapper: low + (a + 1) (high - low) / 2, clipped; its
-    // maze2d has no wrapper and clips alone. May be given `control` itself.
+    // Writes `control`: the action, in [-1, 1], in the actuators' range. D4RL's wrapper computes
+    // low + (a + 1) (high - low) / 2, clipped; its maze2d has no wrapper and only clips. `action` may be `control`.
     void to_control(std::span<const double> action) {
         for (size_t i = 0; i < control.size(); ++i) {
             if (!std::isfinite(action[i]))
@@ -448,21 +451,21 @@ struct MujocoEnvironment {
         }
     }
 
-    // D4RL's maze2d: before a step velocities are brought into [-5, 5] m/s by set_state, under the previous control.
+    // D4RL's maze2d clips velocities to [-5, 5] m/s before a step, by set_state under the previous control.
     void clip_velocity() {
         for (int i = 0; i < model->nv; ++i) data->qvel[i] = std::clamp(data->qvel[i], -5.0, 5.0);
         mj_forward(model.get(), data.get());
     }
 
-    // mujoco-py made every warning of the engine an exception, and D4RL's collection dropped the episode. The engine
-    // itself would set the state back to the start and go on.
+    // mujoco-py made every warning of the engine an exception, and D4RL's collection dropped the episode. By itself the
+    // engine resets the state and goes on. Errors: environment.unstable.
     void check_engine() const {
         for (int i = 0; i < mjNWARNING; ++i)
             if (data->warning[i].number > 0)
-                fail("mujoco.unstable", "%s: step %d: MuJoCo: %s", task->name, steps,
+                fail("environment.unstable", "%s: step %d: MuJoCo: %s", task->name, steps,
                      mju_warningText(i, data->warning[i].lastinfo));
         if (!all_finite())
-            fail("mujoco.unstable", "%s: step %d: a position or velocity is not finite", task->name, steps);
+            fail("environment.unstable", "%s: step %d: a position or velocity is not finite", task->name, steps);
     }
 
     // maze2d: the goal cell's indices. antmaze: the goal cell's centre.
@@ -472,41 +475,21 @@ struct MujocoEnvironment {
         if (task->rules == Rules::maze2d) return {static_cast<double>(cell.row), static_cast<double>(cell.column)};
         return {4.0 * (cell.column - 1), 4.0 * (cell.row - 1)};
     }
-
-    // D4RL's antmaze-v2, at every reset: the goal cell's centre, plus uniform [0, 1), plus uniform [0, 0.5), x before y
-    // each time, then raised to at least 0.
-    template <class Uniform>
-    void draw_goal(Uniform&& uniform) {
-        goal = default_goal();
-        for (const double range : {1.0, 0.5})
-            for (double& g : goal) g += uniform(0, range);
-        for (double& g : goal) g = std::max(g, 0.0);
-    }
 };
 
-// One episode of uniformly random actions, up to the time limit; nothing if the engine spoils it.
-inline std::optional<Trajectory> random_trajectory(MujocoEnvironment& environment, uint32_t seed, uint64_t number) {
-    const EnvironmentSpec spec = environment.spec();
-    const Random random{seed, Stream::data_set};
-    Trajectory trajectory;
-    trajectory.terminated = false;
-    std::vector<float> state(static_cast<size_t>(spec.state_dim)), action(static_cast<size_t>(spec.action_dim));
-    environment.reset(Random{seed, Stream::environment}, data_set_episodes + number, state.data());
-    try {
-        for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps) && !trajectory.terminated; ++t) {
-            for (uint32_t i = 0; i < action.size(); ++i)
-                action[i] = static_cast<float>(2 * random.uniform(number, t, i) - 1);
-            trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
-            trajectory.actions.insert(trajectory.actions.end(), action.begin(), action.end());
-            const Step step = environment.step(action.data(), state.data());
-            trajectory.rewards.push_back(static_cast<float>(step.reward));
-            trajectory.terminated = step.terminated;
-        }
-    } catch (const Error& error) {
-        if (error.id != "mujoco.unstable") throw;
-        return std::nullopt;
-    }
-    return trajectory;
-}
-
 #endif  // WODTEM_MUJOCO
+
+// One episode of uniformly random actions, up to the time limit; nothing if the simulation broke down. `number`: of the
+// trajectory within a data set.
+inline std::optional<Trajectory> random_trajectory(Environment& environment, uint32_t seed, uint64_t number) {
+    const Random resets{seed, Stream::environment}, actions{seed, Stream::data_set};
+    const auto choose = [&](const Episode& episode) {
+        std::vector<float> action(environment.spec().action_dim);
+        for (uint32_t i = 0; i < action.size(); ++i)
+            action[i] = static_cast<float>(2 * actions.uniform(number, episode.trajectory.length(), i) - 1);
+        return action;
+    };
+    Episode episode = play(environment, resets, data_set_episodes + number, choose);
+    if (!episode.error.empty()) return std::nullopt;
+    return std::move(episode.trajectory);
+}

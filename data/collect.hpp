@@ -1,36 +1,46 @@
 // collect.hpp: makes data sets of D4RL's kinds, in D4RL's layout: maze2d by its planner and controller (waypoints.hpp),
 // antmaze by its planner and a walker (antmaze.hpp), and of the gym tasks medium-replay, the replay buffer of a soft
-// actor-critic run (sac.hpp) up to the published return of the medium set, and medium, actions of the policy it ended
-// with.
+// actor-critic run (sac.hpp) up to the published return of the medium set, and medium, the actions of the policy with
+// which such a run ended.
+//
+// In order: policies; training to a level; layouts; the families; the body of `wodtem collect`.
 // Promises: a data set is a function of (task, steps, seed, policy, machine), however often its making was stopped; its
 // metadata say how it was made, so that nobody takes it for D4RL's. Leaves out: expert and random sets.
 #pragma once
 
 #include <chrono>
+#include <filesystem>
 #include <functional>
 #include <string>
 #include <vector>
 
 #include "antmaze.hpp"
+#include "console.hpp"
 #include "d4rl.hpp"
+#include "rows.hpp"
+#include "run_folder.hpp"
 #include "sac.hpp"
+#include "settings.hpp"
 #include "waypoints.hpp"
+
+// Shows the progress of a long command and asks whether to stop it.
+struct Watch {
+    // phase: "collecting" or "training"; share: of the work that is done, in [0, 1]; numbers: a short text.
+    std::function<void(const char* phase, double share, const std::string& numbers)> show = [](auto&&...) {};
+    std::function<bool()> stop = [] { return false; };
+    double checkpoint_every = 60;  // seconds
+};
 
 #ifdef WODTEM_MUJOCO
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Policies.
 
-// A file's bytes as they were when this was compiled, and where they end.
-#define WODTEM_EMBED(name, path)                                                                         \
-    asm(".pushsection .rodata\n" #name ": .incbin \"" path "\"\n" #name "_end: .byte 0\n.popsection\n"); \
-    extern "C" const char name[], name##_end[];
 WODTEM_EMBED(wodtem_hopper_medium, "data/policies/hopper-medium.safetensors")
 WODTEM_EMBED(wodtem_walker2d_medium, "data/policies/walker2d-medium.safetensors")
 WODTEM_EMBED(wodtem_halfcheetah_medium, "data/policies/halfcheetah-medium.safetensors")
 WODTEM_EMBED(wodtem_ant_medium, "data/policies/ant-medium.safetensors")
 WODTEM_EMBED(wodtem_antmaze_walker, "data/policies/antmaze-walker.safetensors")
-#undef WODTEM_EMBED
 
 // A policy that this program holds: "hopper-medium" and so on, or "antmaze-walker". Errors: collect.policy.
 inline sac::SavedPolicy embedded_policy(const std::string& name) {
@@ -47,42 +57,73 @@ inline sac::SavedPolicy embedded_policy(const std::string& name) {
     fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
 }
 
-// Errors: collect.policy.
+// A policy must fit the task's states and actions. Errors: collect.policy.
 inline void check_policy(const sac::SavedPolicy& policy, int inputs, int actions) {
     if (policy.network.inputs() != inputs || policy.network.outputs() != 2 * actions)
-        fail("collect.policy", "the policy sees %d numbers and gives %d actions, not %d and %d: is it another task's?",
+        fail("collect.policy", "the policy has %d inputs and %d actions, expected %d and %d; give this task's policy",
              policy.network.inputs(), policy.network.outputs() / 2, inputs, actions);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Training: a soft actor-critic run that ends at a level.
 
-// Of the observation, from the first on: the others are always 0 (ant's contact forces), and no network sees them.
+// How many entries of the observation a network sees, from the first on: ant's others (contact forces) are always 0.
 inline int live_columns(const MujocoTask& task) { return task.rules == Rules::ant ? 27 : task.state_dim; }
 
-// A gym task with its live columns alone.
-struct LiveTask {
+// A gym task whose states are its live columns alone.
+struct LiveTask : Environment {
     MujocoEnvironment body;
-    std::vector<float> all;
+    std::vector<float> all;  // [task.state_dim] scratch
 
-    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl), all(static_cast<size_t>(task.state_dim)) {}
-    EnvironmentSpec spec() const {
+    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl), all(task.state_dim) {}
+
+    EnvironmentSpec spec() const override {
         EnvironmentSpec spec = body.spec();
         spec.state_dim = live_columns(*body.task);
         return spec;
     }
-    void reset(const Random& random, uint64_t episode, float* state) {
+    void reset(const Random& random, uint64_t episode, float* state) override {
         body.reset(random, episode, all.data());
         std::copy_n(all.begin(), live_columns(*body.task), state);
     }
-    Step step(const float* action, float* state) {
+    Step step(const float* action, float* state) override {
         const Step result = body.step(action, all.data());
         std::copy_n(all.begin(), live_columns(*body.task), state);
         return result;
     }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<LiveTask>(*this); }
 };
 
-// A run ends at the first evaluation whose mean return is `tolerance` times the level from it at most.
+// The same, recording the rows of the present episode as D4RL's files have them. After an error the last row is not
+// complete, and the episode must be dropped. T: see CollectedRows.
+template <class T>
+struct RecordingTask : LiveTask {
+    CollectedRows<T> rows;
+
+    using LiveTask::LiveTask;
+
+    void reset(const Random& random, uint64_t episode, float* state) override {
+        rows = {};
+        LiveTask::reset(random, episode, state);
+    }
+    Step step(const float* action, float* state) override {
+        append_all(rows.observations, body.observation);
+        append_all(rows.qpos, std::span(body.data->qpos, body.model->nq));
+        append_all(rows.qvel, std::span(body.data->qvel, body.model->nv));
+        const Step result = LiveTask::step(action, state);
+        append_all(rows.next_observations, body.observation);
+        append_all(rows.actions, std::span(action, body.task->action_dim));
+        rows.rewards.push_back(static_cast<T>(result.reward));
+        // At the last step allowed only the timeout is set, also if the agent fell there, as in D4RL.
+        const bool timeout = body.steps >= body.task->max_episode_steps;
+        rows.timeouts.push_back(timeout);
+        rows.terminals.push_back(result.terminated && !timeout);
+        return result;
+    }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<RecordingTask>(*this); }
+};
+
+// A run ends at the first evaluation whose mean return is within `tolerance` times the level of the level.
 struct Training {
     std::string name;  // of the policy
     sac::Settings settings;
@@ -90,112 +131,103 @@ struct Training {
     double tolerance = 0.05;
     uint64_t evaluate_every = 5000;  // updates
     int episodes = 40;               // of an evaluation, with sampled actions, as in a medium set
-    int threads = 1;                 // of the learner; what it learns does not depend on it
+    int threads = 1;                 // of the learner; its results do not depend on them
 };
 
-// D4RL's runs made as many updates as steps; ours make fewer updates, which cost more than steps. The buffer keeps an
-// episode more than the set has rows, so that the first row's episode is there from its beginning.
+// Training for a gym task's medium policy and its replay set of `rows` rows. D4RL's runs made as many updates as steps;
+// ours make fewer, because an update costs more than a step. The buffer holds one episode more than the set has rows,
+// so that the episode of the first row is there from its beginning.
 // departs from rlkit: a batch of 128 instead of 256, for half the time.
 inline Training gym_training(const MujocoTask& task, uint32_t seed, size_t rows) {
-    Training training{std::string(task.name) + "-medium", {}, medium_return(task)};
-    training.settings.seed = seed;
-    training.settings.batch = 128;
-    training.settings.capacity = rows + static_cast<uint64_t>(task.max_episode_steps);
-    training.settings.steps_per_update = task.rules == Rules::hopper ? 4 : 2;
-    // These two climb past the level: of the first evaluations that come near it, a lucky one would end the run early.
-    if (task.rules == Rules::walker2d || task.rules == Rules::ant) training.tolerance = 0.04, training.episodes = 100;
-    return training;
+    const uint64_t capacity = rows + task.max_episode_steps, interval = task.rules == Rules::hopper ? 4 : 2;
+    // Returns of these two rise quickly past the level, and a lucky evaluation near it would end the run too early.
+    const bool is_steep = task.rules == Rules::walker2d || task.rules == Rules::ant;
+    return {.name = std::string(task.name) + "-medium",
+            .settings = {.seed = seed, .batch = 128, .capacity = capacity, .steps_per_update = interval},
+            .level = medium_return(task),
+            .tolerance = is_steep ? 0.04 : 0.05,
+            .episodes = is_steep ? 100 : 40};
 }
 
+// Training for antmaze's walker.
 // departs from D4RL's policies: half their width, for a third of the time.
 inline Training walker_training(uint32_t seed) {
-    Training training{walker_name, {}, 400};  // 0.8 m/s over 500 steps
-    training.settings.seed = seed;
-    training.settings.batch = 128;
-    training.settings.hidden = 128;
-    training.settings.steps_per_update = 2;
-    return training;
+    // 0.8 m/s over 500 steps is a return of 400.
+    return {walker_name, {.seed = seed, .hidden = 128, .batch = 128, .steps_per_update = 2}, 400};
 }
 
-// Whoever watches a long command: told how far it is, and asked whether to stop.
-struct Watch {
-    std::function<void(double share, const std::string& numbers)> show = [](double, const std::string&) {};
-    std::function<bool()> stop = [] { return false; };
-    double checkpoint_every = 60;  // seconds
-};
-
-inline Moments sampled_returns(Tape<float>& tape, sac::Network<float>& policy, auto& environment, uint32_t seed,
+// Undiscounted returns of episodes with sampled actions. Episodes in which the simulation breaks down do not count.
+inline Moments sampled_returns(Tape<float>& tape, sac::Network<float>& policy, Environment& environment, uint32_t seed,
                                uint64_t first_episode, int episodes) {
+    sac::Actor actor{tape, policy, seed};
     Moments returns;
-    for (uint64_t i = 0; i < static_cast<uint64_t>(episodes); ++i) {
-        const sac::Episode episode = sac::play(tape, policy, environment, seed, first_episode + i, true, [] {});
-        if (!episode.spoiled) returns.add(episode.total);
+    for (int i = 0; i < episodes; ++i) {
+        const Episode episode = actor.play(environment, first_episode + i);
+        if (episode.error.empty()) returns.add(episode.total_reward);
     }
     return returns;
 }
 
-constexpr uint64_t training_evaluations = uint64_t{1} << 40;  // the numbers of their episodes, each time the same
+constexpr uint64_t training_evaluations = uint64_t{1} << 40;  // the numbers of their episodes, the same at each
 
-// Evaluates the policy after every `evaluate_every` updates, at first with a quarter of the episodes; the whole number
-// decides where that is within four times the tolerance. Begins from the checkpoint if there is one; saves one when it
-// is asked to stop, from time to time, and at the end. Errors: collect.stopped, and those of sac.hpp.
-template <class Environment>
-Moments train_to_level(sac::Learner& learner, Environment& environment, const Training& training,
-                       const std::string& checkpoint, const Watch& watch) {
-    using Clock = std::chrono::steady_clock;
-    Environment other = environment;  // for evaluations
+// Whether the learner's policy is at the level: a quarter of the episodes must come within four times the tolerance,
+// then the whole number within the tolerance. `returns`: of the evaluation that decided.
+inline bool is_at_level(sac::Learner& learner, Environment& environment, const Training& training, Moments& returns) {
     Tape<float> tape(learner.learning.compute);
+    const auto is_near = [&](uint64_t first_episode, int episodes, double tolerance) {
+        returns = sampled_returns(tape, learner.policy, environment, training.settings.seed, first_episode, episodes);
+        return std::fabs(returns.mean() - training.level) <= tolerance * training.level;
+    };
+    return is_near(training_evaluations, (training.episodes + 3) / 4, 4 * training.tolerance) &&
+           is_near(training_evaluations + 1000, training.episodes, training.tolerance);
+}
+
+// Trains until is_at_level() after a multiple of `evaluate_every` updates, and returns the returns found there. Begins
+// from the checkpoint if there is one; saves one when `watch` stops it, every checkpoint_every seconds, and at the end.
+// Errors: collect.stopped, and those of sac.hpp.
+inline Moments train_to_level(sac::Learner& learner, Environment& environment, const Training& training,
+                              const std::string& checkpoint, const Watch& watch) {
+    const std::unique_ptr<Environment> evaluated = environment.clone();
     if (std::filesystem::exists(checkpoint)) {
         sac::load_checkpoint(checkpoint, learner, training.name);
         learner.resume(environment);
     }
     const sac::Progress& p = learner.progress;
-    const auto near = [&](const Moments& returns, double tolerance) {
-        return std::fabs(returns.mean() - training.level) <= tolerance * training.level;
-    };
-    Moments last;
-    double best = 0;  // for the eye alone
-    const auto began = Clock::now();
-    auto saved = began;
     const uint64_t first_update = p.updates;
-    const auto seconds_since = [](Clock::time_point then) {
-        return std::chrono::duration<double>(Clock::now() - then).count();
-    };
-    const auto save = [&] { sac::save_checkpoint(checkpoint, learner, training.name), saved = Clock::now(); };
-    for (uint64_t evaluated = 0;;) {
-        // Whether it is time follows from the learner's state, so a resumed run evaluates where a whole one did.
-        if (p.updates > 0 && p.updates % training.evaluate_every == 0 && p.updates != evaluated) {
-            evaluated = p.updates;
-            const uint32_t seed = training.settings.seed;
-            last =
-                sampled_returns(tape, learner.policy, other, seed, training_evaluations, (training.episodes + 3) / 4);
-            best = std::max(best, last.mean());
-            if (near(last, 4 * training.tolerance)) {
-                last =
-                    sampled_returns(tape, learner.policy, other, seed, training_evaluations + 1000, training.episodes);
-                if (near(last, training.tolerance)) break;
-            }
+    const Clock::time_point began = Clock::now();
+    Clock::time_point saved = began;
+    Moments returns;
+    double best = 0;                 // mean return so far; for display alone
+    uint64_t latest_evaluation = 0;  // its update
+    while (true) {
+        // Whether an evaluation is due follows from the learner's state, so a resumed run evaluates as a whole one.
+        if (p.updates > 0 && p.updates % training.evaluate_every == 0 && p.updates != latest_evaluation) {
+            latest_evaluation = p.updates;
+            if (is_at_level(learner, *evaluated, training, returns)) break;
+            best = std::max(best, returns.mean());
         }
         learner.step(environment);
-        if (p.steps % 1000 != 0 && !watch.stop()) continue;
+        const bool stop = watch.stop();
+        if (p.steps % 1000 != 0 && !stop) continue;
+        const double rate = static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_since(began));
         char numbers[160];
-        int used = std::snprintf(numbers, sizeof numbers, " upd %llu, step %llu, %.0f/s",
-                                 static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.steps),
-                                 static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_since(began)));
-        if (last.count > 0)
-            std::snprintf(numbers + used, sizeof numbers - static_cast<size_t>(used), ", ret %.0f of %.0f", last.mean(),
+        int used =
+            std::snprintf(numbers, sizeof numbers, "update %llu, step %llu, %.0f updates a second",
+                          static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.steps), rate);
+        if (returns.count > 0)
+            std::snprintf(numbers + used, sizeof numbers - used, ", return %.0f of %.0f", returns.mean(),
                           training.level);
-        watch.show(std::clamp(best / training.level, 0.0, 0.99), numbers);
-        if (watch.stop()) {
-            save();
+        watch.show("training", std::clamp(best / training.level, 0.0, 0.99), numbers);
+        if (!stop && seconds_since(saved) <= watch.checkpoint_every) continue;
+        sac::save_checkpoint(checkpoint, learner, training.name);
+        saved = Clock::now();
+        if (stop)
             fail("collect.stopped",
                  "stopped after update %llu; everything is saved in %s, and the same command continues",
                  static_cast<unsigned long long>(p.updates), checkpoint.c_str());
-        }
-        if (seconds_since(saved) > watch.checkpoint_every) save();
     }
-    save();
-    return last;
+    sac::save_checkpoint(checkpoint, learner, training.name);
+    return returns;
 }
 
 inline void save_trained_policy(const std::string& path, const sac::Learner& learner, const Training& training,
@@ -231,105 +263,41 @@ inline void write_origin(Hdf5Writer& file, const Origin& origin) {
     file.add("metadata/seed", {1}, std::array{static_cast<int32_t>(origin.seed)});
 }
 
-inline std::vector<uint8_t> flags_of(const std::vector<float>& values) { return {values.begin(), values.end()}; }
-
-template <class To, class From>
-void append_all(std::vector<To>& to, const From& from) {
-    for (const auto x : from) to.push_back(static_cast<To>(x));
-}
-
-// A gym task's rows, T: float in the medium sets, double in the replay sets, as D4RL has them.
+// Writes the first `steps` rows.
 template <class T>
-struct GymSet {
-    std::vector<T> observations, next_observations;  // [N, S]
-    std::vector<T> actions, rewards;                 // [N, A], [N]
-    std::vector<T> log_probs;                        // [N] of the actions; empty in replay sets
-    std::vector<T> qpos, qvel;                       // [N, Q], [N, V], before the step
-    std::vector<uint8_t> terminals, timeouts;        // [N]
-
-    size_t length() const { return rewards.size(); }
-
-    void append(const GymSet& more) {
-        append_all(observations, more.observations), append_all(next_observations, more.next_observations);
-        append_all(actions, more.actions), append_all(rewards, more.rewards);
-        append_all(log_probs, more.log_probs);
-        append_all(qpos, more.qpos), append_all(qvel, more.qvel);
-        append_all(terminals, more.terminals), append_all(timeouts, more.timeouts);
-    }
-    // What is so before a step.
-    void before(const MujocoEnvironment& environment) {
-        append_all(observations, environment.observation);
-        append_all(qpos, std::span(environment.data->qpos, static_cast<size_t>(environment.model->nq)));
-        append_all(qvel, std::span(environment.data->qvel, static_cast<size_t>(environment.model->nv)));
-    }
-    // Where it led. At the last step allowed only the timeout is set, also if the agent fell on it, as in D4RL.
-    void after(const MujocoEnvironment& environment, std::span<const float> action, const Step& step) {
-        append_all(next_observations, environment.observation);
-        append_all(actions, action);
-        rewards.push_back(static_cast<T>(step.reward));
-        timeouts.push_back(environment.steps >= environment.task->max_episode_steps);
-        terminals.push_back(step.terminated && timeouts.back() == 0);
-    }
-};
-
-// The first `steps` rows.
-template <class T>
-void write_gym_set(Hdf5Writer& file, const GymSet<T>& set, size_t steps) {
-    const auto add = [&](const char* name, const auto& values, bool table) {
-        const size_t width = values.size() / set.length();
-        file.add(name, table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
-    };
-    add("observations", set.observations, true);
-    add("next_observations", set.next_observations, true);
-    add("actions", set.actions, true);
-    add("rewards", set.rewards, false);
-    add("terminals", set.terminals, false);
-    add("timeouts", set.timeouts, false);
-    if (!set.log_probs.empty()) add("infos/action_log_probs", set.log_probs, false);
-    add("infos/qpos", set.qpos, true);
-    add("infos/qvel", set.qvel, true);
-    file.text("metadata/algorithm", "SAC");
+void write_rows(Hdf5Writer& file, const CollectedRows<T>& rows, size_t steps) {
+    rows.each_array([&](const char* name, auto array, bool is_table) {
+        const auto& values = rows.*array;
+        if (values.empty()) return;
+        const size_t width = values.size() / rows.length();
+        file.add(name, is_table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
+    });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The families.
 
-// D4RL's layout of maze2d: eight data sets of N rows, here with the flags as booleans.
-inline void collect_maze2d(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                           const std::function<void(size_t)>& progress) {
-    const MazeDataSet set = collect_maze_data_set(task, steps, origin.seed, progress);
+inline void write_maze_set(const std::string& path, const CollectedRows<float>& rows, const Origin& origin) {
     Hdf5Writer file(path);
-    file.add("observations", {steps, 4}, set.observations);
-    file.add("actions", {steps, 2}, set.actions);
-    file.add("rewards", {steps}, set.rewards);
-    file.add("terminals", {steps}, flags_of(set.terminals));
-    file.add("timeouts", {steps}, flags_of(set.timeouts));
-    file.add("infos/goal", {steps, 2}, set.goal);
-    file.add("infos/qpos", {steps, 2}, set.qpos);
-    file.add("infos/qvel", {steps, 2}, set.qvel);
+    write_rows(file, rows, rows.length());
     write_origin(file, origin);
     file.close();
 }
 
-// D4RL's layout of antmaze: the same eight names. Errors: collect.policy.
+// D4RL's layout of maze2d: eight arrays of N rows, the flags as booleans. `progress`: see collect_maze_data_set.
+inline void collect_maze2d(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
+                           const std::function<void(size_t)>& progress) {
+    write_maze_set(path, collect_maze_data_set(task, steps, origin.seed, progress), origin);
+}
+
+// D4RL's layout of antmaze: the same eight names, terminals as numbers. Errors: collect.policy.
 inline void collect_antmaze(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
                             sac::SavedPolicy walker, const std::function<void(size_t)>& progress) {
     check_policy(walker, walking_ant_state, task.action_dim);
-    const AntMazeSet set = collect_ant_maze_set(task, steps, origin.seed, walker.network, progress);
-    Hdf5Writer file(path);
-    file.add("observations", {steps, 29}, set.observations);
-    file.add("actions", {steps, 8}, set.actions);
-    file.add("rewards", {steps}, set.rewards);
-    file.add("terminals", {steps}, set.terminals);
-    file.add("timeouts", {steps}, set.timeouts);
-    file.add("infos/goal", {steps, 2}, set.goal);
-    file.add("infos/qpos", {steps, 15}, set.qpos);
-    file.add("infos/qvel", {steps, 14}, set.qvel);
-    write_origin(file, origin);
-    file.close();
+    write_maze_set(path, collect_ant_maze_set(task, steps, origin.seed, walker.network, progress), origin);
 }
 
-// D4RL's metadata/policy; a policy that does not see the last columns has zeros for their weights.
+// D4RL's metadata/policy, for states of state_dim numbers; inputs that the policy does not have get weights of 0.
 inline void write_policy(Hdf5Writer& file, const sac::SavedPolicy& policy, size_t state_dim) {
     file.text("metadata/policy/nonlinearity", "relu");
     file.text("metadata/policy/output_distribution", "tanh_gaussian");
@@ -349,78 +317,65 @@ inline void write_policy(Hdf5Writer& file, const sac::SavedPolicy& policy, size_
     sac::each_policy_tensor(policy.network.parameters, add);
 }
 
-// The first `steps` rows of whole episodes of sampled actions. An episode that the engine spoils is left out.
-// Errors: collect.policy.
+// The first `steps` rows of whole episodes of sampled actions. An episode in which the simulation breaks down is left
+// out. `progress` gets the number of rows after every episode. Errors: collect.policy.
 inline void collect_medium(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
                            sac::SavedPolicy policy, const std::function<void(size_t)>& progress) {
     check_policy(policy, live_columns(task), task.action_dim);
-    LiveTask environment(task);
-    const MujocoEnvironment& body = environment.body;
+    RecordingTask<float> environment(task);
     Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
-    GymSet<float> set;
+    sac::Actor actor{tape, policy.network, origin.seed};
+    CollectedRows<float> set;
     for (uint64_t number = data_set_episodes; set.length() < steps; ++number) {
-        GymSet<float> rows;
-        const sac::Episode episode = sac::play(
-            tape, policy.network, environment, origin.seed, number, true, [&] { rows.before(body); },
-            [&](const std::vector<float>& action, const Step& step) { rows.after(body, action, step); });
-        if (episode.spoiled) continue;
-        rows.log_probs = episode.log_probs;
-        set.append(rows);
+        const Episode episode = actor.play(environment, number);
+        if (!episode.error.empty()) continue;
+        environment.rows.log_probs = actor.log_probs;
+        set.append(environment.rows);
         progress(set.length());
     }
     Hdf5Writer file(path);
-    write_gym_set(file, set, steps);
-    write_policy(file, policy, static_cast<size_t>(task.state_dim));
+    write_rows(file, set, steps);
+    file.text("metadata/algorithm", "SAC");
+    write_policy(file, policy, task.state_dim);
     write_origin(file, origin);
     file.close();
 }
 
-// The last `steps` rows of a run's buffer. It holds single precision, neither qpos nor qvel, and live columns alone; but
-// an episode is a function of its number and its actions, so all of it is found again by playing it once more.
+// The last `steps` rows of a run's replay, which itself holds single precision, neither qpos nor qvel, and live columns
+// alone. An episode is a function of its number and its actions, so playing it again yields the rest.
 // Errors: collect.replay.
-inline GymSet<double> retrace(const sac::Learner& learner, LiveTask& environment, size_t steps) {
+inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTask& task, size_t steps) {
     const sac::Replay& replay = learner.replay;
-    const Random resets{learner.settings.seed, Stream::environment};
-    std::vector<float> state(static_cast<size_t>(replay.state_dim));
-    const auto is_at = [&](const float* row) { return std::equal(state.begin(), state.end(), row); };
-    struct Part {
-        uint64_t episode, first, last;  // rows back from the one to be written next, first >= last
-    };
-    std::vector<Part> parts;  // the newest first
-    uint64_t episode = learner.progress.episodes, last = 1;
-    for (uint64_t back = 1; back <= replay.size() && last <= steps; ++back) {
-        if (back < replay.size() && replay.end(replay.recent(back + 1)) == sac::End::none) continue;
-        // An episode that the engine spoiled at its first step has a number and no rows; so has one not begun yet.
-        while (environment.reset(resets, episode, state.data()), !is_at(replay.row(replay.recent(back))))
-            if (episode-- == 0)
-                fail("collect.replay", "no episode of the run begins as the row %zu before its last", back);
-        parts.push_back({episode, back, last});
-        if (episode > 0) --episode;
-        last = back + 1;
-    }
-    GymSet<double> set;
-    for (; !parts.empty(); parts.pop_back()) {
-        const Part& part = parts.back();
-        environment.reset(resets, part.episode, state.data());
-        for (uint64_t back = part.first; back >= part.last; --back) {
-            const size_t row = replay.recent(back);
-            if (back <= steps) set.before(environment.body);
-            const Step step = environment.step(replay.action(row), state.data());
-            if (!is_at(replay.next_state(row)))
-                fail("collect.replay", "episode %llu went another way when it was played again",
-                     static_cast<unsigned long long>(part.episode));
-            if (back <= steps) set.after(environment.body, {replay.action(row), environment.body.control.size()}, step);
-        }
-        // Cut by the engine, or collection stopped there: a timeout, as at the end of D4RL's collection blocks.
-        if (set.terminals.back() == 0) set.timeouts.back() = 1;
+    const auto episode_of = [&](uint64_t back) { return replay.episode(replay.recent(back)); };
+    RecordingTask<double> environment(task);
+    CollectedRows<double>& rows = environment.rows;
+    CollectedRows<double> set;
+    std::vector<float> state(replay.state_dim);
+    uint64_t first = steps;  // rows back to the beginning of the first row's episode
+    while (first < replay.size() && episode_of(first + 1) == episode_of(first)) ++first;
+    for (uint64_t back = first; back > 0; --back) {
+        const size_t row = replay.recent(back);
+        if (back == first || episode_of(back) != episode_of(back + 1))
+            environment.reset({learner.settings.seed, Stream::environment}, episode_of(back), state.data());
+        if (back <= steps)
+            environment.step(replay.action(row), state.data());
+        else
+            environment.LiveTask::step(replay.action(row), state.data());  // not recorded
+        if (!std::equal(state.begin(), state.end(), replay.next_state(row)))
+            fail("collect.replay", "episode %llu went another way when it was played again",
+                 static_cast<unsigned long long>(episode_of(back)));
+        if (back > 1 && episode_of(back) == episode_of(back - 1)) continue;
+        // Cut by a breakdown of the simulation, or by the end of the run: a timeout, as at the end of D4RL's blocks.
+        if (rows.terminals.back() == 0) rows.timeouts.back() = 1;
+        set.append(rows);
     }
     return set;
 }
 
-// Trains, or goes on training from the checkpoint, and writes the buffer to FILE and the policy to
-// FILE.policy.safetensors. If the level is reached before the buffer has `steps` rows, the policy as it is then fills the
-// rest. Errors: collect.stopped, collect.replay.
+// Trains, or continues from the checkpoint, and writes the replay to PATH and the policy to PATH.policy.safetensors. If
+// the level is reached before the replay has `steps` rows, the final policy makes the rest.
+// Errors: collect.stopped, collect.replay.
 inline void collect_medium_replay(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
                                   const Training& training, const std::string& checkpoint, const Watch& watch) {
     LiveTask environment(task);
@@ -429,16 +384,16 @@ inline void collect_medium_replay(const std::string& path, const MujocoTask& tas
     const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
     save_trained_policy(path + ".policy.safetensors", learner, training, returns);
     while (learner.replay.size() < steps) learner.interact(environment);
-    const GymSet<double> set = retrace(learner, environment, steps);
     Hdf5Writer file(path);
-    write_gym_set(file, set, steps);
+    write_rows(file, retrace(learner, task, steps), steps);
+    file.text("metadata/algorithm", "SAC");
     // D4RL's number of the checkpoint, which counts rlkit's epochs of 1000 updates.
     file.add("metadata/iteration", {1}, std::array{static_cast<int32_t>(learner.progress.updates / 1000)});
     write_origin(file, origin);
     file.close();
 }
 
-// The policy of antmaze's walker, trained in the same way.
+// Trains the policy of antmaze's walker in the same way.
 inline void train_walker(const std::string& path, const Training& training, const std::string& checkpoint,
                          const Watch& watch) {
     WalkingAnt environment;
@@ -448,4 +403,107 @@ inline void train_walker(const std::string& path, const Training& training, cons
     save_trained_policy(path, learner, training, returns);
 }
 
+// ---------------------------------------------------------------------------------------------------------------------
+// The body of `wodtem collect`.
+
+// Calls train(checkpoint) with a path in the folder PATH.training, which is locked meanwhile. Once it has returned, the
+// checkpoint is removed, and the folder too unless it holds other files. After an error all stays, to continue from.
+template <class Train>
+void train_in_folder(const std::string& path, Train&& train) {
+    const std::string folder = path + ".training", checkpoint = folder + "/checkpoint.safetensors";
+    make_folder(folder, "collect.folder");
+    const FolderLock lock(folder);
+    stop_on_signals();
+    train(checkpoint);
+    std::error_code ignored;
+    for (const std::string& file : {checkpoint, checkpoint + ".tmp"}) std::filesystem::remove(file, ignored);
+    std::filesystem::remove(folder, ignored);
+}
+
+// Writes to `path` a stand-in of `steps` rows for the published data set `id`, or trains the policy that walks through
+// antmaze where `id` is walker_name, which ignores `steps`. policy_path: a file with the policy that acts; empty: the
+// embedded one. `threads`: of training.
+// Errors: collect.*, run.busy, and those of the files.
+inline void collect_data_set_file(const std::string& id, const std::string& path, size_t steps, uint32_t seed,
+                                  const std::string& policy_path, int threads, const Watch& watch) {
+    const Origin origin{
+        "wodtem collect " + id + " --steps " + std::to_string(steps) + " --seed " + std::to_string(seed), seed};
+    const MujocoTask* task = find_mujoco_task(id);
+    if (!task && id != walker_name) fail("collect.task", "no task of this program has data sets named %s", id.c_str());
+    const auto policy = [&](const std::string& name) {
+        return policy_path.empty() ? embedded_policy(name) : sac::load_policy(policy_path);
+    };
+    const auto show = [&](size_t rows) {
+        const size_t done = std::min(rows, steps);
+        watch.show("collecting", static_cast<double>(done) / static_cast<double>(steps), "row " + std::to_string(done));
+    };
+    if (const auto folder = std::filesystem::path(path).parent_path(); !folder.empty())
+        make_folder(folder, "collect.folder");
+    if (id == walker_name) {
+        Training training = walker_training(seed);
+        training.threads = threads;
+        train_in_folder(path, [&](const std::string& checkpoint) { train_walker(path, training, checkpoint, watch); });
+    } else if (id.find("-medium-replay") != std::string::npos) {
+        Training training = gym_training(*task, seed, steps);
+        training.threads = threads;
+        train_in_folder(path, [&](const std::string& checkpoint) {
+            collect_medium_replay(path, *task, steps, origin, training, checkpoint, watch);
+        });
+    } else if (task->rules == Rules::maze2d) {
+        collect_maze2d(path, *task, steps, origin, show);
+    } else if (task->rules == Rules::antmaze) {
+        collect_antmaze(path, *task, steps, origin, policy(walker_name), show);
+    } else {
+        collect_medium(path, *task, steps, origin, policy(std::string(task->name) + "-medium"), show);
+    }
+}
+
+#else
+
+inline void collect_data_set_file(const std::string&, const std::string& path, size_t, uint32_t, const std::string&,
+                                  int, const Watch&) {
+    fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s", path.c_str(),
+         mujoco_advice);
+}
+
 #endif  // WODTEM_MUJOCO
+
+// The help of collect: every data set, its rows, and the time that its making takes.
+inline std::string collect_help() {
+    std::string text = "\nID, rows, and how long it takes on one core:\n";
+    char line[200];
+    for (const PublishedDataSet& set : published_data_sets) {
+        std::snprintf(line, sizeof line, "  %-30s %8zu  %s\n", set.id, set.steps, set.collected_in);
+        text += line;
+    }
+    std::snprintf(line, sizeof line, "  %-30s %8s  the policy of the antmaze sets, trained anew; 60,000 updates\n",
+                  walker_name, "");
+    return text + line + "A training that was stopped goes on with the same command.\n";
+}
+
+// The command `collect`. out: "" for D4RL's file name in runs/datasets; steps: 0 for as many rows as D4RL's.
+// Errors: usage.task names the nearest data set; those of collect_data_set_file().
+inline void collect(const std::string& id, const std::string& out, int64_t steps, int64_t seed,
+                    const std::string& policy, int threads) {
+    const PublishedDataSet* set = find_published(id);
+    const bool walker = id == walker_name;
+    if (!set && !walker) {
+        std::vector<std::string> names = {walker_name};
+        for (const PublishedDataSet& one : published_data_sets) names.push_back(one.id);
+        fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none; the nearest is %s", id.c_str(),
+             nearest_name(id, names).c_str());
+    }
+    if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);
+    const std::string name = walker ? id + ".safetensors" : file_name(*set);
+    const std::string path = out.empty() ? std::string(own_folder) + "/" + name : out;
+    Console console{.label = id};
+    const Watch watch{[&](const std::string& phase, double share, const std::string& text) {
+                          console.show(phase, share, 0, [&] { return text; });
+                      },
+                      [] { return stop_requested != 0; }};
+    collect_data_set_file(id, path, static_cast<size_t>(steps), static_cast<uint32_t>(seed), policy, threads, watch);
+    if (walker)
+        std::printf("%s: the policy; wodtem collect antmaze-umaze --policy %s\n", path.c_str(), path.c_str());
+    else
+        std::printf("%s: %lld steps; see: wodtem info %s\n", path.c_str(), static_cast<long long>(steps), path.c_str());
+}

@@ -20,6 +20,7 @@
 #include "../memory.hpp"
 #include "../mujoco_env.hpp"
 #include "hdf5.hpp"
+#include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The published data sets. Files and checksums are those that TensorFlow Datasets records; statistics are from its
@@ -320,6 +321,34 @@ inline void require_sound(const Rows& rows, const std::string& path) {
     require("observations", rows.observations, rows.state_dim, any);
     require("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
     require("rewards", rows.rewards, 1, any);
+}
+
+// The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.
+inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task) {
+    const Rows rows = read_data_set(path);
+    std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
+    require_sound(rows, path);
+    return trajectories;
+}
+
+// The offline data of a run with their returns: the grid world's behaviour policy, a file, or uniformly random actions.
+inline std::vector<Trajectory> make_data_set(const Settings& settings) {
+    std::vector<Trajectory> trajectories;
+    const std::unique_ptr<Environment> environment = make_environment(settings);
+    const uint32_t seed = static_cast<uint32_t>(settings.data_seed);
+    if (settings.task == "gridworld")
+        trajectories = collect_data_set(make_grid_world(settings),
+                                        static_cast<Behaviour>(index_of(behaviour_names, settings.behaviour)), seed,
+                                        static_cast<int>(settings.data_trajectories));
+    else if (settings.behaviour == "recorded")
+        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task));
+    else
+        for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
+            if (auto trajectory = random_trajectory(*environment, seed, number))
+                trajectories.push_back(std::move(*trajectory));
+    const EnvironmentSpec spec = environment->spec();
+    for (Trajectory& trajectory : trajectories) relabel(trajectory, spec.state_dim, spec.action_dim, settings.gamma);
+    return trajectories;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

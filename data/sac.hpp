@@ -1,17 +1,16 @@
-// sac.hpp: soft actor-critic (SAC), the learner whose policies made D4RL's locomotion data, for whoever makes such data
-// again: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905 (below: SAC), as rlkit
-// (github.com/rail-berkeley/rlkit, torch/sac) has it, whose defaults stand at Settings.
+// sac.hpp: soft actor-critic (SAC), whose policies made D4RL's locomotion data; it trains the policies of our
+// stand-ins. Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905 (below: SAC), with the
+// defaults of rlkit (github.com/rail-berkeley/rlkit, torch/sac), which stand at Settings.
 //
 // In order: settings; replay; networks; the losses and the target; acting; the learner; files. The losses are
 // templates on the scalar, as all of nn.hpp: float trains, double checks them against finite differences.
-// The environment is any of the project's shape: spec(), reset(random, episode, state), step(action, state).
-// Promises: a run is a function of its settings (for one instruction set), no matter how many threads work on it and how
-// often it was stopped and resumed. Leaves out: discrete actions, normalised observations, several environments at once.
+// Promises: a run is a function of its settings (for one instruction set), for any number of threads and however often
+// it was stopped and resumed. Leaves out: discrete actions, normalised observations, several environments at once.
 //
-// Chance, by the streams of nn.hpp (a run of SAC has a seed of its own):
-//   initialisation  step: tensor, policy, critics in turn; index: element
-//   environment     step: episode, evaluations' as the caller numbers them
-//   exploration     step: episode; index: time-step; site: action dimension. At first a uniform, later a normal number
+// Random streams of nn.hpp (a run of SAC has a seed of its own):
+//   initialisation  step: tensor, numbered through the policy, then the critics; index: element
+//   environment     step: episode; evaluations as the caller numbers them
+//   exploration     step: episode; index: time-step; site: action dimension. First a uniform, later a normal number
 //   batch           step: update; index: row of the batch
 //   entropy_noise   step: update; index: row; site: action dimension of a ~ pi(s), plus action_dim of a' ~ pi(s')
 #pragma once
@@ -20,29 +19,29 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
-#include <initializer_list>
 #include <map>
 #include <string>
 #include <utility>
 #include <vector>
 
-#include "../gridworld.hpp"
+#include "../memory.hpp"
 #include "../nn.hpp"
 #include "safetensors.hpp"
+#include "state.hpp"
 
 namespace sac {
 
-// SAC's table 1, which are rlkit's defaults too (examples/sac.py), but for random_steps: rlkit lets the untrained policy
-// act for 1000 steps, then takes 1000 steps and 1000 updates in turn; here 10,000 uniformly random actions (as SAC's
-// authors' code for some tasks, and OpenAI's Spinning Up for all), then one update after each step: as many in all.
+// SAC's table 1 and rlkit's defaults (examples/sac.py), except for random_steps. rlkit lets the untrained policy act
+// for 1000 steps, then alternates 1000 steps and 1000 updates. Here 10,000 uniformly random actions come first (as in
+// the code of SAC's authors for some tasks, and in OpenAI's Spinning Up), then as many updates as steps.
 struct Settings {
     uint32_t seed = 0;
     int hidden = 256;  // ReLU units in each of two layers
     int batch = 256;
-    uint64_t capacity = 1000000;  // transitions; the oldest make room
+    uint64_t capacity = 1000000;  // transitions; the oldest are overwritten
     uint64_t random_steps = 10000;
     uint64_t steps_per_update = 1;  // of the environment
-    double learning_rate = 3e-4;    // Adam's, of policy, critics and temperature
+    double learning_rate = 3e-4;    // Adam's, for policy, critics and temperature
     double discount = 0.99;
     double target_rate = 5e-3;
     double reward_scale = 1;
@@ -51,37 +50,38 @@ struct Settings {
 // ---------------------------------------------------------------------------------------------------------------------
 // Replay.
 
-enum class End { none = 0, terminated = 1, cut = 2 };  // cut: by the time limit (or the engine); the task went on
+enum class End { none = 0, terminated = 1, cut = 2 };  // cut: by the time limit or a broken-down simulation
 
-// A ring of rows: state [S], action [A], reward, End, next state [S]. A transition is one or two cache lines.
+// A ring buffer of rows: state [S], action [A], reward, End, next state [S], episode's number (exact up to 2^24).
 struct Replay {
     int state_dim, action_dim;
     uint64_t capacity;
     uint64_t next = 0;  // the row that is written next
     std::vector<float> rows = {};
 
-    size_t width() const { return static_cast<size_t>(2 * state_dim + action_dim + 2); }
+    size_t width() const { return 2 * state_dim + action_dim + 3; }
     size_t size() const { return rows.size() / width(); }
     const float* row(size_t i) const { return rows.data() + i * width(); }
     const float* action(size_t i) const { return row(i) + state_dim; }
     float reward(size_t i) const { return action(i)[action_dim]; }
     End end(size_t i) const { return static_cast<End>(static_cast<int>(action(i)[action_dim + 1])); }
     const float* next_state(size_t i) const { return action(i) + action_dim + 2; }
-    // The row written `back` rows before the next one, back >= 1.
+    uint64_t episode(size_t i) const { return static_cast<uint64_t>(next_state(i)[state_dim]); }
+    // The index of the row that was written `back` rows before the next one, back >= 1.
     size_t recent(uint64_t back) const { return (next + capacity - back) % capacity; }
 
-    void add(const float* state, const float* action, double reward, End end, const float* next_state) {
+    void add(const float* state, const float* action, double reward, End end, const float* next_state,
+             uint64_t episode) {
         if (size() < capacity) rows.resize(rows.size() + width());
         float* to = rows.data() + next * width();
         to = std::copy_n(action, action_dim, std::copy_n(state, state_dim, to));
         *to++ = static_cast<float>(reward);
         *to++ = static_cast<float>(end);
-        std::copy_n(next_state, state_dim, to);
+        to = std::copy_n(next_state, state_dim, to);
+        *to = static_cast<float>(episode);
         next = (next + 1) % capacity;
     }
-    void cut_last() {
-        rows[recent(1) * width() + static_cast<size_t>(state_dim + action_dim + 1)] = static_cast<float>(End::cut);
-    }
+    void cut_last() { rows[recent(1) * width() + state_dim + action_dim + 1] = static_cast<float>(End::cut); }
 
     template <class Archive>
     void visit(Archive& archive) {
@@ -99,12 +99,12 @@ template <class T>
 struct Network {
     std::vector<Parameter<T>> parameters;  // weight [out, in] and bias [out] of fc0, fc1 and last_fc
 
-    // rlkit's start: hidden weights uniform in +-1 / sqrt(outputs) (its "fan in" reads the wrong side of the matrix),
-    // hidden biases 0.1, last layer uniform in +-last_range.
+    // rlkit's initialisation: hidden weights uniform in +-1 / sqrt(outputs) (rlkit takes the wrong side of the matrix
+    // for its fan-in), hidden biases 0.1, last layer uniform in +-last_range. first_tensor: the first one's number.
     Network(int in, int hidden, int out, double last_range, uint32_t seed, uint64_t first_tensor) {
         const Random random{seed, Stream::initialisation};
         const auto add = [&](const char* name, const std::vector<int>& shape, double range) {
-            const size_t size = static_cast<size_t>(shape[0]) * static_cast<size_t>(shape.size() == 2 ? shape[1] : 1);
+            const size_t size = shape[0] * (shape.size() == 2 ? shape[1] : 1);
             Parameter<T> p{name, {shape.begin(), shape.end()}, std::vector<T>(size, T(0.1)), std::vector<T>(size)};
             for (uint32_t i = 0; range > 0 && i < size; ++i)
                 p.value[i] = static_cast<T>(range * (2 * random.uniform(first_tensor + parameters.size(), i) - 1));
@@ -125,9 +125,10 @@ struct Network {
 template <class T>
 using Pair = std::array<Network<T>, 2>;  // SAC sec. 6: two critics against overestimation
 
-// y [n, out] = x W^T + b, or max(that, 0): linear() with Relu of nn.hpp in fewer passes, and no packing for one row.
+// A dense layer: y [n, out] = x W^T + b, with ReLU if `rectified`. Without `trained` no gradient reaches W and b. It
+// makes fewer passes over y than linear() of nn.hpp, and packs no matrix for a single row.
 template <class T>
-Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& bias, bool rectified) {
+Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& bias, bool rectified, bool trained) {
     const int in = x.columns, out = weight.rows();
     const Tensor<T> y = tape.make(x.rows, out), w = weight.tensor(), b = bias.tensor();
     Compute& compute = tape.compute;
@@ -140,28 +141,26 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
     if (rectified)
         for (size_t i = 0; i < y.size(); ++i) y.value[i] = y.value[i] < 0 ? T(0) : y.value[i];  // NaN stays
     tape.on_backward(y, [=, &compute] {
-        const View<const T> dy = {y.gradient, out}, dy_turned = {y.gradient, out, true};
+        const View<const T> dy = {y.gradient, out}, dy_transposed = {y.gradient, out, true};
         if (rectified)
             for (size_t i = 0; i < y.size(); ++i) y.gradient[i] = y.value[i] > 0 ? y.gradient[i] : T(0);
         if (x.gradient)  // dx += dy W
             matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, next_store(x));
+        if (!trained) return;
         // dW += dy^T x
-        matmul(compute, View<T>{w.gradient, in}, dy_turned, {x.value, in}, out, in, x.rows, Store::accumulate);
+        matmul(compute, View<T>{w.gradient, in}, dy_transposed, {x.value, in}, out, in, x.rows, Store::accumulate);
         add_column_sums(compute, b.gradient, y.gradient, y.rows, out, out);
     });
     return y;
 }
 
+// The network's output [n, out] for x [n, in]. `trained`: see dense().
 template <class T>
-struct Layers {
-    Tensor<T> first, second, output;  // [n, hidden] after the ReLU, twice, and [n, out]
-};
-
-template <class T>
-Layers<T> forward(Tape<T>& tape, Network<T>& network, Tensor<T> x) {
+Tensor<T> forward(Tape<T>& tape, Network<T>& network, Tensor<T> x, bool trained = true) {
     std::vector<Parameter<T>>& p = network.parameters;
-    const Tensor<T> first = dense(tape, x, p[0], p[1], true), second = dense(tape, first, p[2], p[3], true);
-    return {first, second, dense(tape, second, p[4], p[5], false)};
+    const Tensor<T> first = dense(tape, x, p[0], p[1], true, trained);
+    const Tensor<T> second = dense(tape, first, p[2], p[3], true, trained);
+    return dense(tape, second, p[4], p[5], false, trained);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -173,10 +172,10 @@ struct Batch {
     Tensor<T> rewards, alive;              // [n, 1]; alive: 0 if the task ended there, else 1
 };
 
+// A tensor without gradient, to be filled in; valid until the tape is reset.
 template <class T>
 Tensor<T> input(Tape<T>& tape, int rows, int columns) {
-    const size_t size = static_cast<size_t>(rows) * static_cast<size_t>(columns);
-    return {tape.template scratch<T>(size), nullptr, rows, columns};
+    return {tape.template scratch<T>(static_cast<size_t>(rows) * columns), nullptr, rows, columns};
 }
 
 // The rows pick(0), ..., pick(n - 1) of the replay.
@@ -191,7 +190,7 @@ Batch<T> gather(Tape<T>& tape, const Replay& replay, int n, Pick&& pick) {
         std::copy_n(replay.row(row), S + A, batch.pairs.value + i * (S + A));
         std::copy_n(replay.next_state(row), S, batch.next_states.value + i * S);
         batch.rewards.value[i] = static_cast<T>(replay.reward(row));
-        // A time limit is no part of the task: what follows it counts as if the episode went on.
+        // A time limit is no part of the task: the target bootstraps from the state after it.
         batch.alive.value[i] = replay.end(row) == End::terminated ? T(0) : T(1);
     }
     return batch;
@@ -202,8 +201,9 @@ struct Sample {
     Tensor<T> action, log_prob;  // [n, A] in [-1, 1], [n, 1]
 };
 
-// SAC app. C: a = tanh(u), u = m + exp(l) noise, log pi(a) = log N(u; m, exp(l)) - sum log(1 - tanh(u)^2), of the
-// policy's output [n, 2A]: m, then l, which rlkit clamps to [-20, 2]. noise [n, A] standard normal.
+// SAC app. C, reparametrised: a = tanh(u), u = m + exp(l) noise, and
+// log pi(a) = log N(u; m, exp(l)) - sum log(1 - tanh(u)^2). output [n, 2A]: the policy's, m, then l, which rlkit clamps
+// to [-20, 2]. noise [n, A]: standard normal.
 template <class T>
 Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
     const ptrdiff_t A = output.columns / 2;
@@ -218,7 +218,7 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
             log_prob.value[row] -= T(0.5) * z[j] * z[j] + log_std + T(half_log_2_pi) + log_tanh_slope(u);
         }
     }
-    tape.on_backward({}, [=] {  // of two results, so always
+    tape.on_backward({}, [=] {  // there are two results, so the step is never skipped
         const T *d_action = gradient_of(action), *d_log_prob_of = gradient_of(log_prob);
         T* const d_output = gradient_of(output);
         for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
@@ -233,63 +233,43 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
     return {action, log_prob};
 }
 
-// min_k Q_k(s, a), [n, 1]. Its gradient goes to the actions alone, and each row goes back through the critic that gave
-// the minimum alone: half the work, and none for the critics' parameters.
+// States and actions side by side, [n, S + A]. The gradient goes to the actions alone.
+template <class T>
+Tensor<T> pairs_of(Tape<T>& tape, Tensor<T> states, Tensor<T> actions) {
+    const ptrdiff_t S = states.columns, A = actions.columns;
+    const Tensor<T> pairs = tape.make(states.rows, states.columns + actions.columns);
+    for (ptrdiff_t i = 0; i < pairs.rows; ++i)
+        std::copy_n(actions.value + i * A, A, std::copy_n(states.value + i * S, S, pairs.value + i * (S + A)));
+    tape.on_backward(pairs, [=] {
+        T* const d_actions = gradient_of(actions);
+        for (ptrdiff_t i = 0; i < actions.rows; ++i)
+            for (ptrdiff_t j = 0; j < A; ++j) d_actions[i * A + j] += pairs.gradient[i * (S + A) + S + j];
+    });
+    return pairs;
+}
+
+// min_k Q_k(s, a), [n, 1]. The gradient of a row goes through the critic that gave the minimum, to the action alone:
+// the critics' parameters get none.
 template <class T>
 Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> actions) {
-    const int n = states.rows, S = states.columns, A = actions.columns, hidden = critics[0].hidden();
-    const Tensor<T> y = tape.make(n, 1), pairs = input(tape, n, S + A);
-    for (ptrdiff_t i = 0; i < n; ++i)
-        std::copy_n(actions.value + i * A, A, std::copy_n(states.value + i * S, S, pairs.value + i * (S + A)));
-    std::array<Layers<T>, 2> layers;
-    std::array<std::array<const T*, 3>, 2> weight;
-    const bool recording = std::exchange(tape.recording, false);
-    for (size_t k = 0; k < 2; ++k) {
-        layers[k] = forward(tape, critics[k], pairs);
-        for (size_t layer = 0; layer < 3; ++layer) weight[k][layer] = critics[k].parameters[2 * layer].value.data();
-    }
-    tape.recording = recording;
-    const Tensor<T> q0 = layers[0].output, q1 = layers[1].output;
-    for (ptrdiff_t i = 0; i < n; ++i) y.value[i] = q1.value[i] < q0.value[i] ? q1.value[i] : q0.value[i];
-    if (!recording) return y;
-    Compute& compute = tape.compute;
-    const Tensor<T> d_second = input(tape, n, hidden), d_first = input(tape, n, hidden), d_action = input(tape, n, A);
-    ptrdiff_t* rows = tape.template scratch<ptrdiff_t>(static_cast<size_t>(n));
-    tape.on_backward(y, [=, &compute] {
-        T* const d_actions = gradient_of(actions);
-        for (size_t k = 0; k < 2; ++k) {
-            int m = 0;
-            for (ptrdiff_t i = 0; i < n; ++i)
-                if ((q1.value[i] < q0.value[i]) == (k == 1)) rows[m++] = i;
-            for (ptrdiff_t i = 0; i < m; ++i) {
-                const T *active = layers[k].second.value + rows[i] * hidden, *w = weight[k][2],
-                        dq = y.gradient[rows[i]];
-                T* to = d_second.value + i * hidden;
-                for (ptrdiff_t j = 0; j < hidden; ++j) to[j] = active[j] > 0 ? dq * w[j] : T(0);
-            }
-            matmul(compute, View<T>{d_first.value, hidden}, {d_second.value, hidden}, {weight[k][1], hidden}, m, hidden,
-                   hidden, Store::overwrite);
-            for (ptrdiff_t i = 0; i < m; ++i) {
-                const T* active = layers[k].first.value + rows[i] * hidden;
-                T* to = d_first.value + i * hidden;
-                for (ptrdiff_t j = 0; j < hidden; ++j) to[j] = active[j] > 0 ? to[j] : T(0);
-            }
-            matmul(compute, View<T>{d_action.value, A}, {d_first.value, hidden}, {weight[k][0] + S, S + A}, m, A,
-                   hidden, Store::overwrite);
-            for (ptrdiff_t i = 0; i < m; ++i)
-                for (ptrdiff_t j = 0; j < A; ++j) d_actions[rows[i] * A + j] += d_action.value[i * A + j];
-        }
+    const Tensor<T> pairs = pairs_of(tape, states, actions);
+    const Tensor<T> q0 = forward(tape, critics[0], pairs, false), q1 = forward(tape, critics[1], pairs, false);
+    const Tensor<T> y = tape.make(states.rows, 1);
+    for (ptrdiff_t i = 0; i < y.rows; ++i) y.value[i] = q1.value[i] < q0.value[i] ? q1.value[i] : q0.value[i];
+    tape.on_backward(y, [=] {
+        T *const d_q0 = gradient_of(q0), *const d_q1 = gradient_of(q1);
+        for (ptrdiff_t i = 0; i < y.rows; ++i) (q1.value[i] < q0.value[i] ? d_q1 : d_q0)[i] += y.gradient[i];
     });
     return y;
 }
 
 // SAC eq. (5) and (3): y [n] = scale r + gamma (1 - terminated) (min_k Qbar_k(s', a') - alpha log pi(a' | s')),
-// a' ~ pi(s') by `noise` [n, A]. No gradient; valid until the tape is reset.
+// with a' ~ pi(s') drawn by `noise` [n, A]. It has no gradient and is valid until the tape is reset.
 template <class T>
 const float* q_target(Tape<T>& tape, Network<T>& policy, Pair<T>& targets, const Batch<T>& batch, const float* noise,
                       T alpha, const Settings& settings) {
     const bool recording = std::exchange(tape.recording, false);
-    const Sample<T> sample = draw(tape, forward(tape, policy, batch.next_states).output, noise);
+    const Sample<T> sample = draw(tape, forward(tape, policy, batch.next_states), noise);
     const Tensor<T> q = least_q(tape, targets, batch.next_states, sample.action);
     tape.recording = recording;
     float* y = tape.template scratch<float>(q.size());
@@ -300,7 +280,7 @@ const float* q_target(Tape<T>& tape, Network<T>& policy, Pair<T>& targets, const
     return y;
 }
 
-// Of x [n, 1]: [1, 1].
+// The mean of x [n, 1], [1, 1].
 template <class T>
 Tensor<T> mean(Tape<T>& tape, Tensor<T> x) {
     const std::vector<float> shares(x.size(), 1.0f / static_cast<float>(x.rows));
@@ -310,8 +290,7 @@ Tensor<T> mean(Tape<T>& tape, Tensor<T> x) {
 // SAC eq. (5) without its 1/2, as rlkit: J_Q = sum_k mean (Q_k(s, a) - y)^2, [1, 1]. target [n].
 template <class T>
 Tensor<T> critic_loss(Tape<T>& tape, Pair<T>& critics, const Batch<T>& batch, const float* target) {
-    const Tensor<T> q0 = forward(tape, critics[0], batch.pairs).output,
-                    q1 = forward(tape, critics[1], batch.pairs).output;
+    const Tensor<T> q0 = forward(tape, critics[0], batch.pairs), q1 = forward(tape, critics[1], batch.pairs);
     return combine(tape, T(1), mean(tape, squared_error(tape, q0, target)), T(1),
                    mean(tape, squared_error(tape, q1, target)));
 }
@@ -324,7 +303,7 @@ Tensor<T> policy_loss(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Sample<
 }
 
 // SAC eq. (18), with log alpha for alpha, as rlkit: J(alpha) = mean (-log alpha (log pi(a | s) + target_entropy)).
-// Returns it, and adds its gradient to log alpha's; the policy has no part in it.
+// Returns J and adds its gradient to that of log alpha; the policy gets none.
 template <class T>
 T temperature_loss(Parameter<T>& log_alpha, Tensor<T> log_prob, T target_entropy) {
     T slope = 0;
@@ -341,83 +320,48 @@ EACH_TARGET inline void soft_update(float* __restrict target, const float* __res
 // ---------------------------------------------------------------------------------------------------------------------
 // Acting.
 
-// An action of the policy at one state and its log-probability (D4RL's infos/action_log_probs). noise [A]: standard
-// normal, or zeros for the mean action. The tape is emptied, and records no more.
+// Writes the policy's action [A] at a state [S] and returns its log-probability (D4RL's infos/action_log_probs).
+// noise [A]: standard normal, or zeros for the mean action. The tape is emptied and stops recording.
 inline float act(Tape<float>& tape, Network<float>& policy, const float* state, const float* noise, float* action) {
     tape.reset();
     tape.recording = false;
-    const Sample<float> sample =
-        draw(tape, forward(tape, policy, tape.constant(state, 1, policy.inputs())).output, noise);
+    const Sample<float> sample = draw(tape, forward(tape, policy, tape.constant(state, 1, policy.inputs())), noise);
     std::copy_n(sample.action.value, sample.action.size(), action);
     return sample.log_prob.value[0];
 }
 
-struct Episode {
-    std::vector<float> states, actions, rewards, log_probs;  // [n, S], [n, A], [n], [n]
-    std::vector<float> last_state;                           // [S] after the last step
-    bool terminated = false;
-    bool spoiled = false;  // by the engine: to be dropped
-    double total = 0;      // undiscounted
+// Plays episodes with sampled actions, or with the policy's mean action.
+struct Actor {
+    Tape<float>& tape;
+    Network<float>& policy;
+    uint32_t seed;
+    bool sampled = true;
+    std::vector<float> log_probs = {};  // [T] of the latest episode's actions
+
+    Episode play(Environment& environment, uint64_t number) {
+        log_probs.clear();
+        return ::play(environment, {seed, Stream::environment}, number, [&](const Episode& episode) {
+            const Random random{seed, Stream::exploration};
+            std::vector<float> action(policy.outputs() / 2), noise(action.size());
+            for (uint32_t i = 0; sampled && i < noise.size(); ++i)
+                noise[i] = random.normal(number, episode.trajectory.length(), i);
+            log_probs.push_back(act(tape, policy, episode.state.data(), noise.data(), action.data()));
+            return action;
+        });
+    }
 };
-
-// One episode up to termination or the time limit; before_step() is called with the environment still at states[t],
-// after_step(action, Step) where it led.
-template <class Environment, class BeforeStep,
-          class AfterStep = decltype([](const std::vector<float>&, const Step&) {})>
-Episode play(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed, uint64_t number,
-             bool sampled, BeforeStep&& before_step, AfterStep&& after_step = {}) {
-    const EnvironmentSpec spec = environment.spec();
-    const Random random{seed, Stream::exploration};
-    Episode episode;
-    std::vector<float> state(static_cast<size_t>(spec.state_dim)), action(static_cast<size_t>(spec.action_dim));
-    std::vector<float> noise(action.size());
-    environment.reset(Random{seed, Stream::environment}, number, state.data());
-    try {
-        for (uint32_t t = 0; t < static_cast<uint32_t>(spec.max_episode_steps) && !episode.terminated; ++t) {
-            for (uint32_t i = 0; sampled && i < noise.size(); ++i) noise[i] = random.normal(number, t, i);
-            episode.log_probs.push_back(act(tape, policy, state.data(), noise.data(), action.data()));
-            episode.states.insert(episode.states.end(), state.begin(), state.end());
-            episode.actions.insert(episode.actions.end(), action.begin(), action.end());
-            before_step();
-            const Step step = environment.step(action.data(), state.data());
-            after_step(action, step);
-            episode.rewards.push_back(static_cast<float>(step.reward));
-            episode.total += step.reward;
-            episode.terminated = step.terminated;
-        }
-    } catch (const Error& error) {
-        if (error.id != "mujoco.unstable") throw;
-        episode.spoiled = true;
-    }
-    episode.last_state = state;
-    return episode;
-}
-
-// Mean return of `count` episodes, numbered from first_episode, but for those that the engine spoils.
-template <class Environment>
-double evaluate(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed,
-                uint64_t first_episode, int count, bool sampled) {
-    double total = 0, sound = 0;
-    for (uint64_t i = 0; i < static_cast<uint64_t>(count); ++i) {
-        const Episode episode = play(tape, policy, environment, seed, first_episode + i, sampled, [] {});
-        if (episode.spoiled) continue;
-        total += episode.total;
-        sound += 1;
-    }
-    return total / sound;
-}
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The learner.
 
 struct Progress {
     uint64_t steps = 0, updates = 0, episodes = 0;  // steps of the environment; finished episodes
-    uint64_t episode_steps = 0;
-    double episode_return = 0, last_return = NAN;  // of the present episode so far, of the last finished one
+    uint64_t episode_steps = 0;                     // of the present episode so far
 };
 
-struct Losses {                                                     // of an update
-    double critic = NAN, policy = NAN, alpha = NAN, entropy = NAN;  // entropy: mean -log pi(a | s)
+// Of one update; entropy: mean -log pi(a | s).
+struct Losses {
+    double critic = NAN, policy = NAN, alpha = NAN, entropy = NAN;
 };
 
 struct Learner {
@@ -425,11 +369,11 @@ struct Learner {
     EnvironmentSpec spec;
     Tape<float> learning, acting;
     std::vector<float> action, noise, next_state;  // scratch
-    Losses last;                                   // for whoever watches
+    Losses last;                                   // of the latest update, for display and tests
 
-    // The state of the run, all of it in visit(), but for the environment's, which resume() makes again.
+    // The state of the run, all of it saved by visit(). The environment's own state is not: resume() restores it.
     Progress progress;
-    std::vector<float> state;  // [S] the present one
+    std::vector<float> state;  // [S] of the environment
     Network<float> policy;     // outputs: means, then log standard deviations
     Pair<float> critics, targets;
     std::vector<Parameter<float>> log_alpha;  // one; alpha starts at 1
@@ -442,9 +386,9 @@ struct Learner {
           spec(e),
           learning(compute),
           acting(compute),
-          action(static_cast<size_t>(e.action_dim)),
-          noise(2 * static_cast<size_t>(s.batch) * action.size()),
-          next_state(static_cast<size_t>(e.state_dim)),
+          action(e.action_dim),
+          noise(2 * s.batch * action.size()),
+          next_state(e.state_dim),
           state(next_state),
           policy(e.state_dim, s.hidden, 2 * e.action_dim, 1e-3, s.seed, 0),
           critics{Network<float>(e.state_dim + e.action_dim, s.hidden, 1, 3e-3, s.seed, 6),
@@ -452,17 +396,16 @@ struct Learner {
           targets(critics),
           log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}},
           replay{e.state_dim, e.action_dim, s.capacity} {
-        if (e.moves != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1 ||
+        if (e.discrete_actions != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1 ||
             s.steps_per_update < 1)
-            fail(
-                "sac.settings",
-                "SAC needs continuous actions, a batch, steps between updates and a replay of at least one episode (%d)",
-                e.max_episode_steps);
-        replay.rows.reserve(s.capacity * replay.width());  // untouched until it is needed
+            fail("sac.settings",
+                 "SAC needs continuous actions, batch and steps_per_update of at least 1, and a replay of at least one "
+                 "episode (%d steps)",
+                 e.max_episode_steps);
+        replay.rows.reserve(s.capacity * replay.width());  // address space; the system gives memory at the first write
     }
 
-    // One step of the environment, and after the first random ones an update if its turn has come.
-    template <class Environment>
+    // One step of the environment, then an update at every steps_per_update-th step after the random ones.
     void step(Environment& environment) {
         interact(environment);
         if (progress.steps > settings.random_steps && progress.steps % settings.steps_per_update == 0 &&
@@ -470,7 +413,8 @@ struct Learner {
             update();
     }
 
-    template <class Environment>
+    // One step of the environment into the replay. play() of memory.hpp would not do: updates come between the steps of
+    // an episode, and a checkpoint may be written between any two. A broken-down simulation cuts the episode.
     void interact(Environment& environment) {
         Progress& p = progress;
         if (p.episode_steps == 0)
@@ -481,19 +425,16 @@ struct Learner {
         try {
             const Step result = environment.step(action.data(), next_state.data());
             ++p.episode_steps;
-            p.episode_return += result.reward;
             over = result.terminated || p.episode_steps >= static_cast<uint64_t>(spec.max_episode_steps);
             const End end = result.terminated ? End::terminated : over ? End::cut : End::none;
-            replay.add(state.data(), action.data(), result.reward, end, next_state.data());
+            replay.add(state.data(), action.data(), result.reward, end, next_state.data(), p.episodes);
             state = next_state;
         } catch (const Error& error) {
-            if (error.id != "mujoco.unstable") throw;
+            if (error.id != "environment.unstable") throw;
             if (p.episode_steps > 0) replay.cut_last();
             over = true;
         }
         if (over) {
-            p.last_return = p.episode_return;
-            p.episode_return = 0;
             p.episode_steps = 0;
             ++p.episodes;
         }
@@ -511,7 +452,7 @@ struct Learner {
         act(acting, policy, state.data(), noise.data(), action.data());
     }
 
-    // SAC algorithm 1, in rlkit's order: first the temperature, then all networks from the same old ones.
+    // SAC algorithm 1, in rlkit's order: first the temperature, then all networks, each with gradients at the old ones.
     void update() {
         const Random rows{settings.seed, Stream::batch}, normals{settings.seed, Stream::entropy_noise};
         const uint64_t number = progress.updates++;
@@ -523,14 +464,14 @@ struct Learner {
         Tape<float>& tape = learning;
         const Batch<float> batch =
             gather(tape, replay, settings.batch, [&](uint32_t i) { return rows.below(replay.size(), number, i); });
-        const Sample<float> sample = draw(tape, forward(tape, policy, batch.states).output, noise.data());
+        const Sample<float> sample = draw(tape, forward(tape, policy, batch.states), noise.data());
         temperature_loss(log_alpha[0], sample.log_prob, -static_cast<float>(spec.action_dim));
         adam(log_alpha, alpha_optimizer);
         const float alpha = std::exp(log_alpha[0].value[0]);
         const float* target = q_target(tape, policy, targets, batch, noise.data() + n * A, alpha, settings);
         const Tensor<float> critic = critic_loss(tape, critics, batch, target),
                             actor = policy_loss(tape, critics, batch.states, sample, alpha);
-        tape.backward(combine(tape, 1.0f, critic, 1.0f, actor));  // they share no parameter
+        tape.backward(combine(tape, 1.0f, critic, 1.0f, actor));  // the two losses share no parameter
         adam(policy.parameters, policy_optimizer);
         for (size_t k = 0; k < 2; ++k) {
             adam(critics[k].parameters, critic_optimizers[k]);
@@ -555,8 +496,8 @@ struct Learner {
         update_parameters(learning.compute, parameters, optimizer, config);
     }
 
-    // Brings a fresh environment to where the loaded run stands: the present episode once more, from the replay.
-    template <class Environment>
+    // Brings an environment to the state of a loaded run, by repeating the present episode's actions, which the replay
+    // holds. Errors: sac.resume.
     void resume(Environment& environment) {
         std::vector<float> found = state;
         if (progress.episode_steps > 0)
@@ -570,32 +511,16 @@ struct Learner {
 
     template <class Archive>
     void visit(Archive& archive) {
-        const auto trained = [&](const std::string& name, std::vector<Parameter<float>>& parameters,
-                                 Optimizer& moments) {
-            archive(name + ".updates", moments.updates);
-            moments.first_moment.resize(parameters.size());
-            moments.second_moment.resize(parameters.size());
-            for (size_t i = 0; i < parameters.size(); ++i)
-                for (auto [part, values] : std::initializer_list<std::pair<const char*, std::vector<float>&>>{
-                         {".value.", parameters[i].value},
-                         {".first_moment.", moments.first_moment[i]},
-                         {".second_moment.", moments.second_moment[i]}}) {
-                    values.resize(parameters[i].value.size());  // moments that no update has touched yet are zeros
-                    archive(name + part + parameters[i].name, values);
-                }
-        };
         archive("progress.steps", progress.steps);
         archive("progress.updates", progress.updates);
         archive("progress.episodes", progress.episodes);
         archive("progress.episode_steps", progress.episode_steps);
-        archive("progress.episode_return", progress.episode_return);
-        archive("progress.last_return", progress.last_return);
         archive("state", state);
-        trained("policy", policy.parameters, policy_optimizer);
-        trained("temperature", log_alpha, alpha_optimizer);
+        visit_trained(archive, "policy", policy.parameters, policy_optimizer);
+        visit_trained(archive, "temperature", log_alpha, alpha_optimizer);
         for (size_t k = 0; k < 2; ++k) {
             const std::string number = std::to_string(k);
-            trained("critic" + number, critics[k].parameters, critic_optimizers[k]);
+            visit_trained(archive, "critic" + number, critics[k].parameters, critic_optimizers[k]);
             for (Parameter<float>& parameter : targets[k].parameters)
                 archive("target" + number + "." + parameter.name, parameter.value);
         }
@@ -609,7 +534,7 @@ struct Learner {
 // ---------------------------------------------------------------------------------------------------------------------
 // Files: a checkpoint is the whole state; a policy has the names and shapes of D4RL's metadata/policy.
 
-// What must agree between a checkpoint and the run that loads it.
+// The settings that must agree between a checkpoint and the run that loads it, on one line.
 inline std::string settings_text(const Learner& learner) {
     const Settings& s = learner.settings;
     char text[400];
@@ -624,10 +549,10 @@ inline std::string settings_text(const Learner& learner) {
     return text;
 }
 
-// `note`: what the caller wants to know of the run besides (the task, say); it must be the same when it is loaded.
+// `note`: a text of the caller's, the task's name for instance; load_checkpoint() requires the same one.
 inline void save_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
     TensorFile file;
-    file.metadata["format"] = "wodtem sac checkpoint 1";
+    file.metadata["format"] = "wodtem sac checkpoint 2";
     file.metadata["settings"] = settings_text(learner) + " " + note;
     file.buffer.reserve(learner.replay.rows.size() * sizeof(float) + (16 << 20));
     Saver saver{file};
@@ -635,11 +560,12 @@ inline void save_checkpoint(const std::string& path, Learner& learner, const std
     write_safetensors(path, file);
 }
 
-// After this, resume(). Errors: sac.checkpoint, checkpoint.shape, file.*, safetensors.*; the learner is of no use then.
+// Call resume() afterwards. Errors: sac.checkpoint, checkpoint.shape, file.*, safetensors.*; the learner may then hold
+// half of the checkpoint and must be dropped.
 inline void load_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
     const TensorFile file = read_safetensors(path);
-    if (file.text("format") != "wodtem sac checkpoint 1")
-        fail("sac.checkpoint", "%s: is no checkpoint of a SAC run", path.c_str());
+    if (file.text("format") != "wodtem sac checkpoint 2")
+        fail("sac.checkpoint", "%s: is not a SAC checkpoint of this version; remove it to train anew", path.c_str());
     const std::string wanted = settings_text(learner) + " " + note;
     if (file.text("settings") != wanted)
         fail("sac.checkpoint", "%s: was made with %s, this run has %s", path.c_str(), file.text("settings").c_str(),
@@ -653,7 +579,7 @@ struct SavedPolicy {
     std::map<std::string, std::string> metadata;  // task, physics, return, steps, ...
 };
 
-// Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256], which gives the means, and
+// Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256] (the means) and
 // last_fc_log_std.*: D4RL's names and PyTorch's layout. `parameters` may be const.
 template <class Parameters, class F>
 void each_policy_tensor(Parameters& parameters, F&& f) {
@@ -679,7 +605,7 @@ inline void save_policy(const std::string& path, const SavedPolicy& policy) {
     write_safetensors(path, file);
 }
 
-// Errors: sac.policy, file.*, safetensors.*
+// The policy that save_policy() wrote. Errors: sac.policy, safetensors.*
 inline SavedPolicy policy_of(const TensorFile& file) {
     const Shape first = file.find("fc0.weight").shape, last = file.find("last_fc.weight").shape;
     const auto too_large = [](uint64_t extent) { return extent < 1 || extent > 1 << 14; };

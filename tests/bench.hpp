@@ -10,9 +10,9 @@
 #include "memory_bytes.hpp"
 
 double seconds_of(const std::function<void()>& work) {
-    const auto begin = Console::Clock::now();
+    const Clock::time_point begin = Clock::now();
     work();
-    return Console::seconds_between(begin, Console::Clock::now());
+    return seconds_since(begin);
 }
 
 struct Spread {
@@ -290,13 +290,14 @@ struct Rates {
 // asked for one token alone, and all weights once from memory; its share is of whichever of the two takes longer.
 void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates& rates) {
     std::vector<Episode> playing(episodes);
+    std::vector<Episode*> running;
     for (Episode& episode : playing) {
         episode.trajectory = run.replay.trajectories[0];
-        const size_t steps = static_cast<size_t>(episode.trajectory.length());
-        episode.returns_to_go.assign(steps + 1, 1.0f);
-        episode.state.assign(static_cast<size_t>(run.agent.spec.state_dim), 0.0f);
+        episode.targets.assign(episode.trajectory.rewards.size() + 1, 1.0f);
+        episode.state.assign(run.agent.spec.state_dim, 0.0f);
+        running.push_back(&episode);
     }
-    const SequenceBatch batch = acting_batch(run.agent, playing);
+    const SequenceBatch batch = acting_batch(run.agent, running);
     const FrozenWeights frozen(run.compute);
     const Spread time = timed(9, [&] {
         run.acting.reset();
@@ -314,12 +315,11 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
                   share_of(std::max(operations / rates.products, bytes / rates.memory), time)});
 }
 
-template <class Environment>
 void bench_update(Measurements& measured, const Kernel& kernel, int threads, const Rates& rates, const char* what,
-                  const Settings& settings, const Environment& environment) {
+                  const Settings& settings) {
     Compute compute(kernel, threads);
-    Run run(compute, settings, environment.spec());
-    begin_run(run, make_data_set(settings, environment));
+    Run run(compute, settings, *make_environment(settings));
+    begin_run(run, make_data_set(settings));
     const double operations = update_flops(settings);
     const int repeats = std::max(1, static_cast<int>(1e9 / operations));
     std::vector<double> seconds, shares;
@@ -342,12 +342,11 @@ void bench_updates(Measurements& measured, const Kernel& kernel, int threads, co
     for (const char* preset : {"small", "paper"})
         bench_update(measured, kernel, threads, rates,
                      std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
-                     default_settings("gridworld", "wodtem", preset), GridWorld{});
+                     default_settings("gridworld", "wodtem", preset));
 #ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
     Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
     set_setting(gym, "behaviour", "random");
-    bench_update(measured, kernel, threads, rates, "halfcheetah, preset paper", gym,
-                 MujocoEnvironment(*find_mujoco_task("halfcheetah"), Physics::d4rl));
+    bench_update(measured, kernel, threads, rates, "halfcheetah, preset paper", gym);
 #endif
 }
 
@@ -382,8 +381,7 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     const Trajectory* arrived = arriving.data();
     const double insertion = seconds_of([&] { memory.update(first); });
     const Spread arrival = timed(rounds, [&] { memory.update(*arrived++); });
-    const double build =
-        seconds_of([&] { memory.tree.build(memory.points(), 4, static_cast<uint32_t>(memory.size())); });
+    const double build = seconds_of([&] { memory.rebuild_derived(); });
     memory.update(*arrived++);  // the first eviction orders all entries
     const Spread exchange = timed(rounds - 2, [&] { memory.update(*arrived++); });
     for (size_t i = 0, at = 0; i < 40 * queries; ++i) {
@@ -408,7 +406,7 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);
     add("filling, an entry", {insertion, insertion, insertion}, static_cast<double>(entries));
-    add("building the tree, all", {build, build, build}, 1);
+    add("building tree and hash table, all", {build, build, build}, 1);
     if (!measured.json)
         std::printf("  %.0f bytes an entry\n",
                     static_cast<double>(memory_bytes(memory)) / static_cast<double>(memory.size()));
@@ -502,11 +500,11 @@ void bench_environment(const MujocoTask& task) {
 }
 
 // The learner of the medium-replay sets, on hopper: a step of the environment and an update after each.
-void bench_learner(const std::string& kernel, int threads) {
+void bench_learner(const Kernel& kernel, int threads) {
     LiveTask environment(*find_mujoco_task("hopper"));
     sac::Settings settings = gym_training(*environment.body.task, 0, 20000).settings;
     settings.random_steps = 1000, settings.steps_per_update = 1;
-    Compute compute(kernel_named(kernel), threads);
+    Compute compute(kernel, threads);
     sac::Learner learner(settings, environment.spec(), compute);
     const auto learn = [&] {
         for (const uint64_t end = learner.progress.updates + 200; learner.progress.updates < end;)
@@ -576,3 +574,21 @@ void bench_random_policy(int threads) {
 }
 
 #endif
+
+void command_bench(const Arguments& arguments) {
+    kernel_of(arguments);  // refuses what the machine lacks
+    const int threads = thread_count(arguments);
+    const std::string what = arguments.words.empty() ? "updates" : arguments.words[0];
+    if (what != "updates" && what != "environments" && what != "random-policy")
+        fail("usage.words", "bench cannot measure \"%s\"; it is updates, environments or random-policy", what.c_str());
+    if (what == "updates") return bench_all(arguments["--kernel"], threads, arguments.has("--json"));
+#ifdef WODTEM_MUJOCO
+    std::printf("MuJoCo %s, uniformly random actions\n", mujoco_version().c_str());
+    if (what == "random-policy") return bench_random_policy(threads);
+    std::printf("one core, physics d4rl; medians of 25 rounds; overhead: beside the engine's calls alone\n");
+    for (const MujocoTask& task : mujoco_tasks) bench_environment(task);
+    bench_learner(kernel_of(arguments), threads);
+#else
+    fail("mujoco.absent", "MuJoCo 2.2 was not there when this program was built; %s", mujoco_advice);
+#endif
+}

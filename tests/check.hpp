@@ -768,12 +768,16 @@ void check_tokens(Case& c) {
 // Topic: acting
 
 // An environment that shows given states, one after the other, and pays given rewards, whatever is done.
-struct Recording {
+struct Recording : Environment {
     const Array<float>& states;    // [T, S]
     const Array<double>& rewards;  // [T]
     size_t t = 0;
 
-    Step step(const float*, float* state) {
+    Recording(const Array<float>& shown, const Array<double>& paid) : states(shown), rewards(paid) {}
+    EnvironmentSpec spec() const override { return {states.back(), 1, 0, states.extent(0)}; }
+    void reset(const Random&, uint64_t, float*) override {}
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Recording>(*this); }
+    Step step(const float*, float* state) override {
         const double reward = rewards.values[t];
         const size_t S = states.shape[1], next = std::min(++t, rewards.values.size() - 1);
         std::copy_n(&states.values[next * S], S, state);
@@ -807,20 +811,19 @@ void check_acting(Case& c) {
     EnvironmentSpec spec{};
     spec.state_dim = config.state_dim;
     spec.action_dim = discrete ? 1 : config.action_dim;
-    spec.moves = discrete ? config.action_dim : 0;
+    spec.discrete_actions = discrete ? config.action_dim : 0;
     // The agent prepares windows and chooses actions; its own network, of which only the kind of head counts, is small.
     const bool deterministic = config.head == Head::deterministic;
     settings.method = deterministic ? "dt" : "odt";
     settings.layers = settings.heads = 1;
     settings.width = deterministic ? 8 : std::max(8, config.action_dim);
-    Agent agent{settings, spec, Transformer<float>(transformer_config(settings, spec), 0), {}};
+    Agent agent(settings, spec);
     agent.normaliser = {c.in<float>("state_mean", {S}).values, c.in<float>("state_deviation", {S}).values};
 
-    Recording environment{states, rewards};
-    std::vector<Episode> episodes(1);
-    Episode& episode = episodes[0];
+    Recording environment(states, rewards);
+    Episode episode{};
+    Episode* const running[] = {&episode};
     episode.state.assign(states.values.begin(), states.values.begin() + static_cast<ptrdiff_t>(S));
-    episode.returns_to_go = {static_cast<float>(target * settings.reward_scale)};
     Tape<float> tape(c.compute);
     tape.recording = false;
     std::vector<int> lengths, timesteps;
@@ -828,7 +831,8 @@ void check_acting(Case& c) {
     std::vector<double> uniform;
     const auto append = [](auto& to, const auto* from, size_t n) { to.insert(to.end(), from, from + n); };
     for (uint32_t t = 0; t < T; ++t) {
-        const SequenceBatch window = acting_batch(agent, episodes);
+        append_target(episode, target, settings.reward_scale);
+        const SequenceBatch window = acting_batch(agent, running);
         const size_t n = window.timesteps.size();
         append(lengths, window.lengths.data(), 1);
         append(timesteps, window.timesteps.data(), n);
@@ -843,15 +847,16 @@ void check_acting(Case& c) {
         uniform.push_back(random.uniform(number, t));
         const std::vector<float> action =
             choose_action(agent, policy, 0, samples ? Act::sample : Act::most_likely, random, number, t);
-        step_episode(episode, environment, action, settings.reward_scale);
+        episode.step(environment, action.data(), spec.action_dim);
     }
+    append_target(episode, target, settings.reward_scale);
     const uint64_t n = timesteps.size();
     c.expect("window/lengths", {T}, lengths, true);
     c.expect("window/timesteps", {n}, timesteps, true);
     c.expect("window/returns_to_go", {n}, window_returns, true);
     c.expect("window/states", {n, S}, window_states, true);
     c.expect("window/actions", {n - T, A}, window_actions, true);
-    c.expect("returns_to_go", {T + 1}, episode.returns_to_go, true);
+    c.expect("returns_to_go", {T + 1}, episode.targets, true);
     c.expect(discrete ? "log_probabilities" : "mean", {T, A}, policies, true);
     if (config.head == Head::squashed_gaussian) c.expect("log_std", {T, A}, log_std, true);
     if (samples && discrete) c.expect("uniform", {T}, uniform, true);
@@ -893,10 +898,10 @@ void check_policy_gaussian(Case& c) {
         std::vector<float> sampled, likely, clamped;
         std::vector<double> slack;  // of a sum that cancels: a dozen roundings of exp(log_std) noise, through tanh
         for (size_t i = 0; i < mean.size(); ++i) {
-            likely.push_back(squashed_action(policy.output.value[i]));
+            likely.push_back(clamp_action(std::tanh(policy.output.value[i])));
             if (noise.empty()) continue;
             const float spread = std::exp(policy.log_std.value[i]) * noise[i];
-            const double a = sampled.emplace_back(squashed_action(policy.output.value[i] + spread));
+            const double a = sampled.emplace_back(clamp_action(std::tanh(policy.output.value[i] + spread)));
             slack.push_back(12 * 0x1p-24 * std::fabs(spread) * (1 - a * a));
         }
         constexpr double most = 4 * 0x1p-24;  // the clamp takes off 1e-6
@@ -932,8 +937,8 @@ void check_policy_discrete(Case& c) {
         const auto uniform = c.has("in/uniform") ? c.uniform_in("uniform", rows) : c.in_or<double>("uniform", rows, 0);
         for (int row = 0; row < logits.rows; ++row) {
             const float* p = log_p.value + static_cast<ptrdiff_t>(row) * logits.columns;
-            likely.push_back(most_likely_move(p, logits.columns));
-            sampled.push_back(sampled_move(p, logits.columns, uniform.values[static_cast<size_t>(row)]));
+            likely.push_back(most_likely_action(p, logits.columns));
+            sampled.push_back(sampled_action(p, logits.columns, uniform.values[static_cast<size_t>(row)]));
         }
         c.expect("most_likely", rows, likely, true);
         if (c.has("in/uniform")) c.expect("sampled", rows, sampled);
@@ -1086,7 +1091,7 @@ void check_memory_lookup(Case& c) {
             distances.push_back(there ? found[i][k].distance : INFINITY);
         }
         count.push_back(static_cast<int>(found[i].size()));
-        e_hat.push_back(table.memory.approximate_return(found[i]));
+        e_hat.push_back(approximate_return(table.memory, found[i]));
     }
     c.expect("neighbours", {m, found.K}, neighbours, c.has("out/e_hat"));
     c.expect("count", {m}, count, true);
@@ -1117,8 +1122,8 @@ void check_weights(Case& c) {
     const double alpha = c.number("alpha", {}, 0, 1);
     std::vector<double> w, e_hat;
     for (size_t i = 0; i < m; ++i) {
-        w.push_back(table.memory.weight(table.memory.is_optimal(found[i], d.values[i]), alpha));
-        e_hat.push_back(table.memory.approximate_return(found[i]));
+        w.push_back(EpisodicMemory::weight(table.memory.is_optimal(found[i], d.values[i]), alpha));
+        e_hat.push_back(approximate_return(table.memory, found[i]));
     }
     c.expect("w", {m}, w);
     c.expect("e_hat", {m}, e_hat, true);
@@ -1127,13 +1132,23 @@ void check_weights(Case& c) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Topics: objective and optimiser
 
+// Forward, objective and backward of one update, as update() makes them.
+template <class T>
+Objective<T> learn(Tape<T>& tape, const Transformer<T>& model, const Batch& batch, const float* noise,
+                   std::type_identity_t<T> lambda, bool constrain_entropy) {
+    const Policy<T> policy = forward(tape, model, batch.sequences, Queries::every_state);
+    const Objective<T> result = objective(tape, policy, batch, noise, lambda, constrain_entropy);
+    tape.backward(result.lagrangian);
+    return result;
+}
+
 // The batch of the objective: weights [n] (default 1), remembered_actions (default: the actions), and the share of each
 // step in the mean over steps, then windows.
 Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& config) {
     Batch batch;
     batch.sequences = windows.sequences;
     batch.actions = windows.actions;
-    batch.remembered =
+    batch.advised_actions =
         c.has("in/remembered_actions") ? actions_in(c, "remembered_actions", windows, config) : windows.actions;
     batch.weights = c.in_or<float>("weights", windows.steps, 1).values;
     if (config.head == Head::squashed_gaussian)
@@ -1143,8 +1158,8 @@ Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& confi
     if (c.has("in/weights")) c.in_range("weights", windows.steps, 0.0f, 1.0f, "from 0 to 1");
     const std::vector<int>& lengths = windows.sequences.lengths;
     for (const int length : lengths)
-        batch.mean.insert(batch.mean.end(), static_cast<size_t>(length),
-                          1.0 / (static_cast<double>(lengths.size()) * length));
+        batch.coefficients.insert(batch.coefficients.end(), static_cast<size_t>(length),
+                                  1.0 / (static_cast<double>(lengths.size()) * length));
     return batch;
 }
 
@@ -1438,10 +1453,10 @@ void check_normalize(Case& c) {
 // cell, move [m] -> next_cell; and by step(): state [m, S], reward, terminated [m]. Without them: the behaviour
 // policy's exact statistics, mean_length, sd_length, mean_return, sd_return.
 void check_gridworld(Case& c) {
-    const auto edge = static_cast<EdgeRule>(choice(edge_rule_names, c.word("edge", "clipped|stays|wraps|excluded")));
+    const auto edge = static_cast<EdgeRule>(index_of(edge_rule_names, c.word("edge", "clipped|stays|wraps|excluded")));
     if (!c.has("in/cell")) {
         const auto behaviour =
-            static_cast<Behaviour>(choice(behaviour_names, c.word("behaviour", "right_down|left_down")));
+            static_cast<Behaviour>(index_of(behaviour_names, c.word("behaviour", "right_down|left_down")));
         const ChainStatistics s = chain_statistics(behaviour, edge);
         c.precision = Precision::float64;
         c.expect("mean_length", {}, std::vector<double>{s.mean_length});
@@ -1456,7 +1471,7 @@ void check_gridworld(Case& c) {
     GridWorld world;
     world.edge = edge;
     world.encoding =
-        static_cast<StateEncoding>(choice(state_encoding_names, c.word("encoding", "coordinates|one_hot")));
+        static_cast<StateEncoding>(index_of(state_encoding_names, c.word("encoding", "coordinates|one_hot")));
     std::vector<int> next, terminated;
     std::vector<double> reward;
     std::vector<float> state;
@@ -1537,9 +1552,9 @@ void check_advice(Case& c) {
         std::vector<Neighbour> found;
         for (size_t k = i * K; k < i * K + static_cast<size_t>(count.values[i]); ++k)
             found.push_back({distance.values[k], static_cast<uint32_t>(k)});
-        e_hat.push_back(memory.approximate_return(found));
+        e_hat.push_back(approximate_return(memory, found));
+        w.push_back(EpisodicMemory::weight(memory.is_optimal(found, d.values[i]), alpha));
         const bool drawn = !memory.is_optimal(found, d.values[i]);
-        w.push_back(memory.weight(!drawn, alpha));
         const float* action = drawn ? memory.advised_action(found, uniform.values[i]) : nullptr;
         for (size_t j = 0; j < memory.A; ++j) a_hat.push_back(drawn ? action[j] : NAN);
     }
@@ -1663,7 +1678,7 @@ void check_environment(Case& c) {
     if (!task || name != task->name)
         fail("check.topic", "%s: unknown task \"%s\"; wodtem tasks lists them", c.file.path.c_str(), name.c_str());
 #ifdef WODTEM_MUJOCO
-    MujocoEnvironment environment(*task, static_cast<Physics>(choice(physics_names, c.word("physics", "d4rl|2.2"))));
+    MujocoEnvironment environment(*task, static_cast<Physics>(index_of(physics_names, c.word("physics", "d4rl|2.2"))));
     const uint64_t nq = static_cast<uint64_t>(environment.model->nq), nv = static_cast<uint64_t>(environment.model->nv),
                    A = static_cast<uint64_t>(task->action_dim), S = static_cast<uint64_t>(task->state_dim);
     const auto qpos = c.in<double>("qpos", {any, nq}), qvel = c.in<double>("qvel", {qpos.shape[0], nv});
@@ -1913,7 +1928,7 @@ void command_check(const Arguments& arguments) {
     if (dumps == arguments["--run"].empty() || dumps != arguments.words.empty())
         fail("usage.words", "wodtem check takes vector files, or --dump FILE --run DIR");
     if (dumps) return vectors::dump_run(arguments["--dump"], {arguments["--run"]}, arguments);
-    Compute compute(kernel_named(arguments["--kernel"]), thread_count(arguments));
+    Compute compute(kernel_of(arguments), thread_count(arguments));
     size_t bad = 0;
     for (const std::string& path : arguments.words) {
         try {

@@ -46,16 +46,16 @@ void dump_settings(Dump& dump, const Run& run) {
         dump.set(name, setting_text(s, setting_row(name)));
     dump.set("always_adapt", s.lamb_always_adapt ? "1" : "0");
     dump.set("updates_before", std::to_string(run.optimizer.updates));
-    if (run.remembers()) dump.set("alpha", number_text(s.alpha));
-    if (run.remembers()) dump.set("tau", number_text(s.tau));
+    if (run.agent.uses_memory()) dump.set("alpha", number_text(s.alpha));
+    if (run.agent.uses_memory()) dump.set("tau", number_text(s.tau));
 }
 
 // The batch, and of each step what the memory knows: its neighbours (count of them; distance, e and action of each,
 // closest first), d, the number that draws a-hat -> e_hat, w, a_hat (NaN: none is drawn).
 void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vector<float>& noise) {
-    const uint64_t n = batch.mean.size(), A = static_cast<uint64_t>(run.agent.spec.action_dim),
+    const uint64_t n = batch.coefficients.size(), A = static_cast<uint64_t>(run.agent.spec.action_dim),
                    S = static_cast<uint64_t>(run.agent.spec.state_dim), K = batch.neighbours.K;
-    const Shape actions = run.agent.spec.moves > 0 ? Shape{n} : Shape{n, A};
+    const Shape actions = run.agent.spec.discrete_actions > 0 ? Shape{n} : Shape{n, A};
     const std::vector<int>& lengths = batch.sequences.lengths;
     dump.add("in/lengths", {lengths.size()}, std::vector<int64_t>(lengths.begin(), lengths.end()));
     dump.add("in/timesteps", {n},
@@ -64,9 +64,9 @@ void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vecto
     dump.add("in/states", {n, S}, batch.sequences.states);
     dump.add("in/actions", actions, batch.actions);
     dump.add("in/weights", {n}, batch.weights);
-    dump.add("in/remembered_actions", actions, batch.remembered);
+    dump.add("in/remembered_actions", actions, batch.advised_actions);
     if (!noise.empty()) dump.add("in/noise", {n, A}, noise);
-    if (!run.remembers()) return;
+    if (!run.agent.uses_memory()) return;
     std::vector<int64_t> count;
     std::vector<float> distance(n * K, INFINITY), neighbour_actions(n * K * A), a_hat(n * A, NAN);
     std::vector<double> e(n * K), e_hat, w, uniform;
@@ -78,10 +78,11 @@ void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vecto
             e[i * K + k] = run.memory.e[found[k].entry];
             std::copy_n(&run.memory.actions[found[k].entry * A], A, &neighbour_actions[(i * K + k) * A]);
         }
-        e_hat.push_back(run.memory.approximate_return(found));
+        e_hat.push_back(approximate_return(run.memory, found));
         const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);
-        w.push_back(run.memory.weight(optimal, run.agent.settings.alpha));
-        uniform.push_back(run.random(Stream::remembered_action).uniform(run.progress.updates, batch.numbers[i]));
+        w.push_back(EpisodicMemory::weight(optimal, run.agent.settings.alpha));
+        uniform.push_back(
+            run.agent.random(Stream::advised_action).uniform(run.progress.updates, batch.random_index[i]));
         if (!optimal) std::copy_n(run.memory.advised_action(found, uniform[i]), A, &a_hat[i * A]);
     }
     dump.add("in/memory/count", {n}, count);
@@ -99,21 +100,22 @@ void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vecto
 void dump_update(Run& run, const std::string& path) {
     Dump dump{{}, "update_" + std::to_string(run.progress.updates + 1)};
     dump_settings(dump, run);
-    std::vector<Parameter<float>>&parameters = run.agent.model.parameters, &temperature = run.temperature.log_lambda;
-    const bool constrain = run.constrains_entropy();
+    std::vector<Parameter<float>>&parameters = run.agent.model.parameters,
+    &temperature = run.agent.temperature.log_lambda;
+    const bool constrain = run.agent.constrains_entropy();
     dump_parameters(dump, parameters, run.optimizer);
-    if (constrain) dump_parameters(dump, temperature, run.temperature.optimizer);
+    if (constrain) dump_parameters(dump, temperature, run.agent.temperature.optimizer);
     if (constrain) dump.add("in/log_temperature", {}, temperature[0].value);
     Batch batch = sample_batch(run, 0, static_cast<uint32_t>(run.agent.settings.batch_size));
     consult_memory(run, batch);
-    const std::vector<float> noise = entropy_noise(run, run.compute, batch);
+    const std::vector<float> noise = entropy_noise(run, batch);
     dump_batch(dump, run, batch, noise);
 
     Tape<float> tape(run.compute);
     LayerOutputs<float> layers;
     layers.watch(tape);
     const Objective<float> result =
-        learn(tape, run.agent.model, batch, noise.data(), run.temperature.lambda(), constrain);
+        learn(tape, run.agent.model, batch, noise.data(), run.agent.temperature.lambda(), constrain);
     for (const auto& output : layers.outputs) {
         dump.add("out/layer/" + output.name, output.shape, output.value);
         dump.add("out/layer_gradient/" + output.name, output.shape,
@@ -130,7 +132,7 @@ void dump_update(Run& run, const std::string& path) {
     for (const Parameter<float>& parameter : parameters)
         dump.add("out/after_1/" + parameter.name, parameter.shape, parameter.value);
     if (constrain) {
-        update_lambda(run.compute, run.temperature, run.agent.settings, static_cast<double>(result.H.value[0]));
+        update_lambda(run.compute, run.agent.temperature, run.agent.settings, static_cast<double>(result.H.value[0]));
         dump.add("out/log_temperature", {1}, temperature[0].value);
     }
     write_safetensors(path, dump.file);
@@ -139,10 +141,10 @@ void dump_update(Run& run, const std::string& path) {
 }
 
 // Errors: dump.weights; those of the data set.
-void dump_run(const std::string& path, const RunFolder& folder, const Arguments& arguments) {
+void dump_run(const std::string& path, RunFolder folder, const Arguments& arguments) {
     Settings settings = settings_from_text(read_file(folder.file("settings"), 1 << 20), folder.file("settings"));
-    const std::string checkpoint = folder.file("checkpoint.safetensors");
-    if (settings.first_weights != "none" && !fs::exists(checkpoint))
+    const bool resumes = folder.has("checkpoint.safetensors");
+    if (settings.first_weights != "none" && !resumes)
         fail("dump.weights",
              "%s began with a model's weights, which it does not hold; dump it while it has a checkpoint",
              folder.path.c_str());
@@ -154,15 +156,16 @@ void dump_run(const std::string& path, const RunFolder& folder, const Arguments&
             fail("dump.dataset", "%s is not the data set of %s, whose SHA-256 is %s; give it by --dataset",
                  settings.dataset_path.c_str(), folder.path.c_str(), settings.dataset_sha256.c_str());
     }
-    with_environment(settings, [&](const auto& environment) {
-        Compute compute(kernel_named(arguments["--kernel"], settings.arithmetic), thread_count(arguments));
-        Run run(compute, settings, environment.spec());
-        if (fs::exists(checkpoint)) load_state(run, checkpoint);
-        if (!fs::exists(checkpoint)) begin_run(run, make_data_set(settings, environment));
-        if (fs::exists(checkpoint) && run.progress.online == 0) fill_replay(run, make_data_set(settings, environment));
-        run.agent.model.config.dropout = 0;
-        dump_update(run, path);
-    });
+    Compute compute(kernel_for(settings.arithmetic), thread_count(arguments));
+    Run run(compute, settings, *make_environment(settings));
+    if (resumes)
+        load_state(folder, settings, [&](auto& archive) { visit_state(archive, run); });
+    else
+        begin_run(run, make_data_set(settings));
+    if (resumes && run.progress.online == 0)
+        start_offline(run, offline_set(make_data_set(settings), settings.keep_lowest));
+    run.agent.model.config.dropout = 0;
+    dump_update(run, path);
 }
 
 }  // namespace vectors

@@ -125,7 +125,7 @@ TEST(ant_is_sent_to_the_next_cell_and_at_last_to_the_goal) {
 // The walker
 
 TEST(walker_sees_the_world_turned_by_its_heading) {
-    const Random random{test_seed(), 1000};
+    const Random random{test_seed(), Stream::data_set};
     for (uint64_t trial = 0; trial < 200; ++trial) {
         std::vector<double> o(29);
         for (uint32_t i = 0; i < 29; ++i) o[i] = static_cast<double>(random.normal(trial, i));
@@ -154,7 +154,7 @@ TEST(walker_sees_the_world_turned_by_its_heading) {
 
 TEST(walking_ant_is_paid_its_speed_in_the_commanded_direction) {
     WalkingAnt ant;
-    const Random resets{test_seed(), Stream::environment}, random{test_seed(), 1000};
+    const Random resets{test_seed(), Stream::environment}, random{test_seed(), Stream::data_set};
     std::vector<float> state(27), action(8);
     ant.reset(resets, 3, state.data());
     std::vector<double> headings = {ant.heading};
@@ -192,14 +192,15 @@ TEST(walking_ant_is_paid_its_speed_in_the_commanded_direction) {
 // antmaze's rows
 
 TEST(ant_maze_rewards_test_the_next_row_against_one_goal) {
-    AntMazeSet set;
-    set.resize(5);
+    CollectedRows<float> set;
+    set.observations.resize(29 * 5);
+    set.timeouts.resize(5);
     const std::array<std::array<float, 2>, 5> places = {{{0, 0}, {3.5f, 4}, {3.51f, 4}, {4, 3.4f}, {4, 4}}};
     for (size_t row = 0; row < 5; ++row) std::copy_n(places[row].begin(), 2, &set.observations[29 * row]);
     set.timeouts[2] = 1;  // the next row is another episode's: tested all the same
     relabel(set, {4, 4}, false);
     CHECK(set.rewards == (std::vector<float>{1, 1, 0, 1, 0}));
-    CHECK(set.terminals == set.rewards);
+    CHECK(set.numeric_terminals == set.rewards);
     relabel(set, {4, 4}, true);  // the first of a run alone
     CHECK(set.rewards == (std::vector<float>{1, 0, 0, 1, 0}));
     relabel(set, {40, 4}, false);
@@ -213,10 +214,10 @@ TEST(every_row_of_an_ant_maze_set_is_what_it_is_defined_to_be) {
         MujocoTask task = task_of(name);
         task.max_episode_steps = 40;  // many episodes in a short test; 700 is the same code
         constexpr size_t steps = 1500;
-        const AntMazeSet set = collect_ant_maze_set(task, steps, test_seed(), walker);
+        const CollectedRows<float> set = collect_ant_maze_set(task, steps, test_seed(), walker);
         CHECK(set.length() == steps && set.observations.size() == 29 * steps && set.actions.size() == 8 * steps);
         CHECK(set.goal.size() == 2 * steps && set.qpos.size() == 15 * steps && set.qvel.size() == 14 * steps);
-        CHECK(set.rewards.size() == steps && set.terminals == set.rewards);
+        CHECK(set.rewards.size() == steps && set.numeric_terminals == set.rewards);
         MujocoEnvironment environment(task, Physics::d4rl);
         std::vector<float> state(29);
         std::vector<int> starts(5 * 5), goals(5 * 5);
@@ -256,10 +257,10 @@ TEST(every_row_of_an_ant_maze_set_is_what_it_is_defined_to_be) {
         CHECK_EQUAL(cells(starts), diverse ? "11 12 13 23 32 33 " : "11 ");
         CHECK_EQUAL(cells(goals), diverse ? "11 12 13 23 31 32 33 " : "31 ");
 
-        AntMazeSet less = collect_ant_maze_set(task, 500, test_seed(), walker);  // the beginning of more
+        CollectedRows<float> less = collect_ant_maze_set(task, 500, test_seed(), walker);  // the beginning of more
         CHECK(std::equal(less.observations.begin(), less.observations.end(), set.observations.begin()));
         CHECK(std::equal(less.rewards.begin(), less.rewards.end() - 1, set.rewards.begin()));
-        const AntMazeSet other = collect_ant_maze_set(task, 50, test_seed() + 1, walker);
+        const CollectedRows<float> other = collect_ant_maze_set(task, 50, test_seed() + 1, walker);
         CHECK(!std::equal(other.observations.begin(), other.observations.end(), set.observations.begin()));
     }
 }
@@ -267,7 +268,7 @@ TEST(every_row_of_an_ant_maze_set_is_what_it_is_defined_to_be) {
 // An action is the walker's mean action plus 0.2 times a normal number, clipped.
 TEST(ant_maze_actions_are_the_walkers_plus_noise) {
     sac::Network<float> walker(27, 16, 16, 1e-6, test_seed(), 0);  // its actions are nearly 0
-    const AntMazeSet set = collect_ant_maze_set(task_of("antmaze-umaze"), 1000, test_seed(), walker);
+    const CollectedRows<float> set = collect_ant_maze_set(task_of("antmaze-umaze"), 1000, test_seed(), walker);
     Moments noise;
     for (const float a : set.actions) noise.add(a);
     CHECK_CLOSE(noise.mean(), 0, 5 * 0.2 / std::sqrt(8000));
@@ -418,15 +419,14 @@ TEST(retraced_rows_are_those_of_the_buffer) {
         settings.seed = test_seed();
         settings.capacity = steps + 1000;
         settings.random_steps = 1u << 30;
-        LiveTask environment(task), again(task);
+        LiveTask environment(task);
         const size_t live = static_cast<size_t>(live_columns(task)), S = static_cast<size_t>(task.state_dim),
                      A = static_cast<size_t>(task.action_dim);
         sac::Learner learner(settings, environment.spec(), one_thread());
+        learner.progress.episodes = 2;        // as if two had broken down at their first step
         for (const int more : {350, 1500}) {  // before the ring wraps, and after
             for (int i = 0; i < more; ++i) learner.interact(environment);
-            if (more == 350) learner.progress.episodes += 2;  // as if the engine had spoiled two at their first step
-            const GymSet<double> set = retrace(learner, again, steps);
-            if (more == 350) learner.progress.episodes -= 2;
+            const CollectedRows<double> set = retrace(learner, task, steps);
             CHECK_EQUAL(set.length(), steps);
             CHECK(set.observations.size() == S * steps && set.actions.size() == A * steps && set.log_probs.empty());
             for (size_t i = 0; i < steps; ++i) {
@@ -447,7 +447,7 @@ TEST(retraced_rows_are_those_of_the_buffer) {
             }
         }
         learner.replay.rows[learner.replay.width() * learner.replay.recent(1) + live + A + 2] += 1;  // where it led
-        CHECK_FAILS("collect.replay", retrace(learner, again, steps));
+        CHECK_FAILS("collect.replay", retrace(learner, task, steps));
     }
 }
 
@@ -517,6 +517,77 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
         if (!ends && t + 1 < rows.count)
             CHECK(std::equal(rows.observation(t + 1), rows.observation(t + 1) + 111, &rows.next_observations[111 * t]));
         if (ends) length = 0;
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The body of `wodtem collect`
+
+TEST(a_finished_training_removes_its_own_files_alone) {
+    const Scratch scratch("folder");
+    const std::string path = scratch / "set.hdf5", folder = path + ".training";
+    const auto train = [&](bool stop) {
+        train_in_folder(path, [&](const std::string& checkpoint) {
+            write_file_atomic(checkpoint, "the state of a run");
+            write_file_atomic(checkpoint + ".tmp", "half of a state");
+            CHECK_FAILS("run.busy", train_in_folder(path, [](const std::string&) { CHECK(!"two at once"); }));
+            if (stop) fail("collect.stopped", "as agreed");
+        });
+    };
+    CHECK_FAILS("collect.stopped", train(true));
+    CHECK_EQUAL(read_file(folder + "/checkpoint.safetensors"), "the state of a run");
+    train(false);
+    CHECK(!std::filesystem::exists(folder));
+
+    std::filesystem::create_directories(folder + "/notes");
+    write_file_atomic(folder + "/notes/mine", "not wodtem's");
+    train(false);
+    CHECK_EQUAL(read_file(folder + "/notes/mine"), "not wodtem's");
+    CHECK(!std::filesystem::exists(folder + "/checkpoint.safetensors"));
+    CHECK(!std::filesystem::exists(folder + "/checkpoint.safetensors.tmp"));
+
+    write_file_atomic(scratch / "file", "");
+    CHECK_FAILS("collect.folder", make_folder(scratch / "file/below", "collect.folder"));
+}
+
+TEST(a_collected_file_says_how_it_was_made_and_shows_its_progress) {
+    const Scratch scratch("file");
+    double share = 0;
+    Watch watch;
+    watch.show = [&](const char* phase, double done, const std::string&) {
+        CHECK_EQUAL(phase, std::string("collecting"));
+        CHECK(done >= share && done <= 1);
+        share = done;
+    };
+    const auto collect = [&](const std::string& id, const std::string& name, const std::string& policy = "") {
+        share = 0;
+        collect_data_set_file(id, scratch / name, 10000, 7, policy, 1, watch);
+        const Hdf5File file = open_hdf5(scratch / name);
+        CHECK(file.find("metadata/made_by"));
+        const std::string made_by = "wodtem collect " + id + " --steps 10000 --seed 7";
+        CHECK(read_file(scratch / name).find(made_by) != std::string::npos);
+        CHECK_EQUAL(read_rows(file).count, size_t{10000});
+        CHECK_EQUAL(share, 1.0);
+    };
+    collect("maze2d-umaze-v1", "new/folder/maze.hdf5");
+    collect("hopper-medium-v2", "hopper.hdf5");
+    const std::string policy = scratch / "policy.safetensors";
+    sac::save_policy(policy, {sac::Network<float>(11, 16, 6, 0.1, test_seed(), 0), {}});
+    collect("hopper-medium-v2", "other.hdf5", policy);
+    CHECK(read_file(scratch / "hopper.hdf5") != read_file(scratch / "other.hdf5"));
+    CHECK_FAILS("collect.task", collect("lunar-lander-v2", "x.hdf5"));
+    CHECK_FAILS("collect.policy", collect("antmaze-umaze-v2", "x.hdf5", policy));
+}
+
+// The path of the whole command to a training that is stopped at its first question.
+TEST(collecting_a_replay_set_or_a_walker_trains_and_stops_when_asked) {
+    const Scratch scratch("trains");
+    Watch watch;
+    watch.stop = [] { return true; };
+    for (const char* id : {"hopper-medium-replay-v2", walker_name}) {
+        const std::string path = scratch / id;
+        CHECK_FAILS("collect.stopped", collect_data_set_file(id, path, 2000, 1, "", 1, watch));
+        CHECK(std::filesystem::exists(path + ".training/checkpoint.safetensors") && !std::filesystem::exists(path));
     }
 }
 

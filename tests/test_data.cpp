@@ -1,5 +1,5 @@
 // test_data.cpp: data/safetensors.hpp against a file written by hand, published checksums and damage of every kind;
-// data/figures.hpp for well-formed XML, honest numbers and tables that name the line they stumble over.
+// data/figures.hpp for well-formed XML and honest numbers.
 #include <sys/resource.h>
 #include <sys/wait.h>
 
@@ -366,17 +366,19 @@ constexpr double not_measured = std::numeric_limits<double>::quiet_NaN();
 }  // namespace
 
 TEST(ticks_are_round_and_cover_the_data) {
-    const svg::Axis a = svg::linear_axis(3, 47, 5);
-    CHECK(a.ticks == (std::vector<double>{0, 10, 20, 30, 40, 50}));
-    CHECK_EQUAL(svg::linear_axis(-0.25, 0.25, 5).label(-0.2), "\u22120.2");
-    CHECK_EQUAL(svg::linear_axis(0, 20000, 5).label(20000), "20,000");
-    CHECK_EQUAL(svg::linear_axis(0, 1, 5).label(0.6000000000000001), "0.6");
-    CHECK(svg::log_axis(5, 100).ticks == (std::vector<double>{5, 10, 20, 50, 100}));
-    CHECK_EQUAL(svg::log_axis(0.01, 1000).label(0.01), "0.01");
-    CHECK_EQUAL(svg::log_axis(0.01, 1000).label(1000), "1,000");
+    const auto labels = [](const svg::Axis& axis) {
+        std::string out;
+        for (const svg::Tick& tick : axis.ticks) out += tick.label + " ";
+        return out;
+    };
+    CHECK_EQUAL(labels(svg::linear_axis(3, 47, 5)), "0 10 20 30 40 50 ");
+    CHECK_EQUAL(labels(svg::linear_axis(-0.25, 0.25, 5)), "\u22120.3 \u22120.2 \u22120.1 0.0 0.1 0.2 0.3 ");
+    CHECK_EQUAL(labels(svg::linear_axis(0, 20000, 5)), "0 5,000 10,000 15,000 20,000 ");
+    CHECK_EQUAL(labels(svg::linear_axis(0, 1, 5)), "0.0 0.2 0.4 0.6 0.8 1.0 ");
+    CHECK_EQUAL(labels(svg::linear_axis(94, 97, 5)), "94.0 94.5 95.0 95.5 96.0 96.5 97.0 ");
     // Hostile ranges: nothing, zero, denormal, one value, two that differ in the last bit.
     for (const auto& [low, high] :
-         {std::pair(1.0, 0.0), {0.0, 0.0}, {1e-310, 1e-310}, {-3.0, -3.0}, {1e17, 1e17 + 16}}) {
+         {std::pair(1.0, 0.0), {0.0, 0.0}, {1e-310, 1e-310}, {-3.0, -3.0}, {1e15, 1e15 + 0.125}, {-2e15, 2e15}}) {
         const svg::Axis axis = svg::linear_axis(low, high, 5);
         CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14 &&
               (low > high || (axis.low <= low && axis.high >= high)));
@@ -385,146 +387,133 @@ TEST(ticks_are_round_and_cover_the_data) {
     for (uint32_t i = 0; i < 2000; ++i) {
         const double scale = std::pow(10.0, 20 * random.uniform(i, 0) - 10);
         const double x = scale * (random.uniform(i, 1) - 0.5), y = x + scale * (i % 3 == 0 ? 0 : random.uniform(i, 2));
-        for (const svg::Axis& axis : {svg::linear_axis(x, y, 5), svg::log_axis(scale, scale + (y - x))}) {
-            const double slack = 1e-9 * (axis.high - axis.low);
-            CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14);
-            CHECK(axis.log || (axis.low <= x + slack && axis.high >= y - slack));
-            CHECK(!axis.log || (axis.low <= scale && axis.high >= scale + (y - x)));
-        }
+        const svg::Axis axis = svg::linear_axis(x, y, 5);
+        const double slack = 1e-9 * (axis.high - axis.low);
+        CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14);
+        CHECK(axis.low <= x + slack && axis.high >= y - slack);
     }
 }
 
-TEST(numbers_and_text_are_written_for_xml) {
+TEST(numbers_and_text_are_written_for_xml_and_readers) {
     CHECK_EQUAL(svg::number(-0.001), "0");
     CHECK_EQUAL(svg::number(12.5), "12.5");
     CHECK_EQUAL(svg::number(100), "100");
+    CHECK_EQUAL(svg::grouped(1234567.891, 2), "1,234,567.89");
+    CHECK_EQUAL(svg::grouped(-999, 0), "\u2212999");
+    CHECK_EQUAL(svg::grouped(-0.001, 2), "0.00");
+    CHECK_EQUAL(svg::grouped(not_measured, 2), "-");
     CHECK_EQUAL(svg::escaped("<a b=\"c\"> & \x01\u00e9"), "&lt;a b=&quot;c&quot;&gt; &amp; ?\u00e9");
     CHECK(!well_formed("<a>") && !well_formed("<a></b>") && !well_formed("a & b") && !well_formed("<a b=\"/>"));
 }
 
 TEST(line_chart_breaks_at_missing_values) {
-    LineChart chart{"R & D <1>", "steps", "length", {}, {{"best: 5", Colour::black, 5}}};
-    chart.series.push_back(
-        {"a", Colour::blue, {0, 1, 2, 3, 4, 5, 6}, {9, 8, not_measured, not_measured, 7, not_measured, 6}, {}});
-    chart.series.push_back({"b", Colour::green, {0, 1}, {9, 1e300}, {1, not_measured}});
-    for (const bool log_y : {false, true}) {
-        chart.log_y = log_y;
-        const std::string svg = line_chart(chart);
-        check_figure(svg);
-        CHECK_EQUAL(count(svg, "<path"), size_t{4});    // 0-1, 4, 6 and the one point of b
-        CHECK_EQUAL(count(svg, "<circle"), size_t{3});  // runs of one point
-        CHECK_EQUAL(count(svg, "<polygon"), size_t{1});
-        CHECK_EQUAL(count(svg, "R &amp; D &lt;1&gt;"), size_t{2});
-        CHECK_EQUAL(line_chart(chart), svg);
-    }
-    check_figure(line_chart({"nothing yet", "x", "y", {}, {}}));
-    chart.series = {{"a", Colour::blue, {0, 20700}, {9, 8}, {}}};
-    CHECK_EQUAL(count(line_chart(chart), ">25,000<"), size_t{1});
-    chart.cut_x = true;
-    CHECK_EQUAL(count(line_chart(chart), ">25,000<"), size_t{0});
-    CHECK_EQUAL(count(line_chart(chart), ">20,000<"), size_t{1});
-    for (const double x : {0.0, not_measured, 1e300}) {
-        chart.series[0].x = {x, x};
-        check_figure(line_chart(chart));
+    const double no = not_measured;
+    svg::Chart chart{"R & D <1>", "steps", "length", {0, 1, 2, 3, 4, 5, 6}, {}, {}, {{"best: 5", svg::black, 5}}};
+    chart.series.push_back({"a", svg::blue, {9, 8, no, no, 7, no, 6}, {no, no, no, no, no, no, no}});
+    chart.series.push_back({"b", svg::green, {9, 1e300, no, no, no, no, no}, {1, no, no, no, no, no, no}});
+    const std::string svg = svg::draw_chart(chart);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "fill-opacity"), size_t{4});          // pieces: 0-1, 4, 6 and the one point of b
+    CHECK_EQUAL(count(svg, "<circle"), size_t{4});               // a dot ends each
+    CHECK_EQUAL(count(svg, "Z\" fill=\"#000000\""), size_t{2});  // the mark, and the legend's
+    CHECK_EQUAL(count(svg, "R &amp; D &lt;1&gt;"), size_t{2});
+    CHECK_EQUAL(svg::draw_chart(chart), svg);
+    check_figure(svg::draw_chart({"nothing yet", "x", "y"}));
+    for (const double value : {0.0, no, 1e300, -1e300, 9e14}) {
+        chart.series = {{"a", svg::blue, std::vector<double>(7, value), std::vector<double>(7, value)}};
+        chart.marks[0].value = value;
+        check_figure(svg::draw_chart(chart));
     }
     chart.series[0].mean.pop_back();
-    CHECK_FAILS("figure.length", line_chart(chart));
+    CHECK_FAILS("figure.length", svg::draw_chart(chart));
+    chart.series = {{"a", svg::blue, std::vector<double>(7, 1), {}}};
+    CHECK_FAILS("figure.length", svg::draw_chart(chart));
+}
+
+TEST(line_chart_ends_with_the_data_and_places_points_by_hand) {
+    // The y axis is 0..10 on 350..50; its labels are at most two digits wide, so x = 0 lies at 50 + 26 * 0.61.
+    const svg::Chart chart{"t", "x", "y", {0, 20700}, {}, {{"a", svg::blue, {2, 10}, {3, 0}}}, {{"m", svg::green, 5}}};
+    const std::string svg = svg::draw_chart(chart);
+    CHECK_EQUAL(count(svg, ">20,000<"), size_t{1});
+    CHECK_EQUAL(count(svg, ">25,000<"), size_t{0});
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 290 680 50 \""), size_t{1});
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 200 680 50 680 50 65.86 350 Z\""), size_t{1});  // the band is cut at zero
+    CHECK_EQUAL(count(svg, "d=\"M 683 200 688 193 693 200 688 207 Z\""), size_t{1});    // the mark beside the plot
 }
 
 TEST(bar_chart_draws_one_bar_per_number) {
-    BarChart chart{"t", "x", "y", {"R", "D", "R-D"}, {{"a", Colour::blue, {1, not_measured, 70}, {0.5, 1, 2}}}};
-    const std::string svg = bar_chart(chart);
+    svg::Chart chart{"t", "x", "y", {}, {"R", "D", "R-D"}, {{"a", svg::blue, {1, not_measured, 70}, {0.5, 1, 2}}}, {}};
+    const std::string svg = svg::draw_chart(chart);
     check_figure(svg);
-    CHECK_EQUAL(count(svg, "<rect"), size_t{4});  // background, two bars, legend
-    CHECK_EQUAL(count(svg, "rotate(-45"), size_t{0});
-    chart.categories = {"a label that is far too long for its place", "D", "R-D"};
-    CHECK_EQUAL(count(bar_chart(chart), "rotate(-45"), size_t{3});
-    check_figure(bar_chart({"nothing yet", "x", "y", {}, {}}));
+    CHECK_EQUAL(count(svg, "<rect"), size_t{4});               // background, two bars, legend
+    CHECK_EQUAL(count(svg, "stroke=\"#222222\""), size_t{2});  // and their strokes
+    CHECK_EQUAL(count(svg, "y=\"87.5\""), size_t{1});          // 70 of 80 on 350..50
+    CHECK_EQUAL(count(svg, "height=\"262.5\""), size_t{1});
+    CHECK_EQUAL(count(svg, "y1=\"80\"") + count(svg, "y2=\"95\""), size_t{2});  // 72 and 68
+    for (const char* label : {">R<", ">D<", ">R-D<"}) CHECK_EQUAL(count(svg, label), size_t{1});
     chart.series[0].deviation.pop_back();
-    CHECK_FAILS("figure.length", bar_chart(chart));
+    CHECK_FAILS("figure.length", svg::draw_chart(chart));
 }
 
-TEST(grid_policy_draws_one_arrow_per_action) {
-    GridPolicy policy{
-        "p",    2,      3, {{0, 1, 1}, {1, 1, 0.5}, {1, 0, not_measured}, {-1, 0, 0}, {0, 1, 7}, {0, 0, 1}},
-        {0, 0}, {1, 2}, {}};
-    policy.path = {{0, 0}, {0, 1}, {1, 2}};
-    const std::string svg = grid_policy(policy);
+TEST(legend_begins_a_new_row_before_the_edge) {
+    const std::vector<svg::Key> keys(3, {"", "a label"});  // 34 + 13 * 0.61 * 7 = 89.51 wide, and a gap of 18
+    const std::string svg = svg::picture(250, 100, "t", "", keys);
+    CHECK_EQUAL(count(svg, "translate(16 100 )") + count(svg, "translate(123.51 100 )"), size_t{2});
+    CHECK_EQUAL(count(svg, "translate(16 124 )"), size_t{1});
+    CHECK_EQUAL(count(svg, "viewBox=\"0 0 250 146 \""), size_t{1});
+}
+
+TEST(map_draws_one_arrow_per_action_on_filled_cells) {
+    svg::CellMap map{"p", 2, 3, "#B9DAEF", {{0, 0}, {0, 1}, {1, 2}}, {}, {{{1, 2}, "G", svg::green}}, {}, {}, {}};
+    map.arrows = {{{0, 0}, 0, 1, 1}, {{0, 1}, 1, 1, 0.5}, {{0, 2}, 1, 0, 0.25}, {{1, 0}, -1, 0, 0}};
+    const std::string svg = svg::draw_map(map);  // cells of 200, the first at (48, 76)
     check_figure(svg);
-    CHECK_EQUAL(count(svg, "<polygon"), size_t{4 + 3});  // and three in the legend
-    CHECK_EQUAL(count(svg, "#B9DAEF"), size_t{3 + 1});
-    policy.arrows.pop_back();
-    CHECK_FAILS("figure.length", grid_policy(policy));
+    CHECK_EQUAL(count(svg, "<g opacity"), size_t{4});
+    CHECK_EQUAL(count(svg, "#B9DAEF"), size_t{3});
+    CHECK_EQUAL(count(svg, "<rect x=\"448\" y=\"276\" width=\"200\" height=\"200\""), size_t{1});
+    CHECK_EQUAL(count(svg, "d=\"M 216 176 190 191.6 190 160.4 Z\""), size_t{1});  // R: half a length is 0.34 of 200
+    CHECK_EQUAL(count(svg, ">G<"), size_t{1});
 }
 
-TEST(maze_paths_draws_the_map_as_printed_and_each_path_on_it) {
+TEST(map_draws_paths_with_their_ends_and_circles) {
     // Three rows and four columns: cells of 150, the first at (48, 76).
-    MazePaths maze{"m <1>", "1111/1001/1011/", 0.5, "goal & radius", {}};
-    maze.paths = {{{1, 2}, {{1, 1}, {1, 1.5}, {1, 2}}}, {{1, 2}, {{2, 1}, {1, 1}}}};
-    const std::string svg = maze_paths(maze);
+    svg::CellMap map{
+        "m <1>", 3, 4, "#C8C8C8", {{2, 2}}, {}, {}, {{{1, 2}, 0.5, svg::ink}}, {}, {{"", "goal & radius"}}};
+    map.paths = {{{{1, 1}, {1, 1.5}, {1, 2}}, svg::blue}, {{{2, 1}, {1, 1}}, svg::green}};
+    const std::string svg = svg::draw_map(map);
     check_figure(svg);
-    CHECK_EQUAL(count(svg, "#C8C8C8"), size_t{9});  // walls
-    CHECK_EQUAL(count(svg, "<rect x=\"198\" y=\"376\""), size_t{0});
-    CHECK_EQUAL(count(svg, "<rect x=\"348\" y=\"376\""), size_t{1});               // row 2, column 2
-    CHECK_EQUAL(count(svg, "d=\"M 273 301 348 301 423 301 \""), size_t{1});        // a row goes from left to right
-    CHECK_EQUAL(count(svg, "d=\"M 273 451 273 301 \""), size_t{1});                // upwards from row 2 to row 1
-    CHECK_EQUAL(count(svg, "<circle cx=\"423\" cy=\"301\" r=\"75\""), size_t{1});  // one goal for both
-    CHECK_EQUAL(count(svg, "r=\"5\""), size_t{2 + 1});                             // starts, and the legend's
-    CHECK_EQUAL(count(svg, "stroke-width=\"3\""), size_t{2 * (2 + 1)});            // ends are crosses
+    CHECK_EQUAL(count(svg, "#C8C8C8"), size_t{1});
+    CHECK_EQUAL(count(svg, "<rect x=\"348\" y=\"376\""), size_t{1});         // row 2, column 2
+    CHECK_EQUAL(count(svg, "d=\"M 273 301 348 301 423 301 \""), size_t{1});  // a row goes from left to right
+    CHECK_EQUAL(count(svg, "d=\"M 273 451 273 301 \""), size_t{1});          // upwards from row 2 to row 1
+    CHECK_EQUAL(count(svg, "<circle cx=\"423\" cy=\"301\" r=\"75\""), size_t{1});
+    CHECK_EQUAL(count(svg, "r=\"5\""), size_t{2});                 // starts
+    CHECK_EQUAL(count(svg, "stroke-width=\"3\""), size_t{2 * 2});  // ends are crosses
     CHECK_EQUAL(count(svg, "goal &amp; radius"), size_t{1});
-    CHECK_EQUAL(maze_paths(maze), svg);
-
-    maze.paths[1].goal = {1, 1};
-    maze.goal_radius = 0.125;
-    const std::string two_goals = maze_paths(maze);
-    CHECK_EQUAL(count(two_goals, "r=\"18.75\" fill=\"none\" stroke=\"#0072B2\""), size_t{1});
-    CHECK_EQUAL(count(two_goals, "r=\"18.75\" fill=\"none\" stroke=\"#D55E00\""), size_t{1});
+    CHECK_EQUAL(svg::draw_map(map), svg);
+    map.paths = {{{{-1e12, 1}, {1, 1}, {1e12, 9}}, svg::blue}};  // far off: on the edge
+    CHECK_EQUAL(count(svg::draw_map(map), "d=\"M 273 76 273 301 648 526 \""), size_t{1});
 }
 
-TEST(maze_path_leaves_out_small_steps_and_what_is_no_number) {
-    MazePaths maze{"m", "111/101/111/", 0.5, "", {}};  // cells of 160
-    std::vector<Place>& places = maze.paths.emplace_back().places;
-    for (int i = 0; i <= 1000; ++i) places.push_back({1, 0.5 + 0.001 * i});  // one cell long
-    std::string svg = maze_paths(maze);
-    check_figure(svg);
-    const size_t from = svg.find("d=\"M "), length = svg.find('"', from + 3) - from;
-    CHECK(count(svg.substr(from, length), " 316 ") >= 48 && count(svg.substr(from, length), " 316 ") <= 52);
-    CHECK(svg.substr(from, length).ends_with(" 368 316 "));  // the last place, however near
-
-    maze.paths[0] = {{not_measured, 1}, {{1, not_measured}, {1, 1}, {1, 2}, {1e300, 1}, {2, 2}, {1, 2}, {-1e20, 9}}};
-    svg = maze_paths(maze);
-    check_figure(svg);
-    CHECK_EQUAL(count(svg, "d=\"M 288 316 448 316 M 448 476 448 316 528 76 \""), size_t{1});  // far off: on the edge
-    CHECK_EQUAL(count(svg, "<circle"), size_t{2});  // of the legend: neither goal nor start is a place
-    for (const char* map : {"", "/", "///", "1", "1/11111/x"})
-        check_figure(maze_paths({"", map, not_measured, "", {{{0, 0}, {}}, {{0, 1}, {{0, 0}}}}}));
+TEST(pages_are_one_well_formed_file_and_aligned_markdown) {
+    const Table table{{"method", "a|b"}, {{"<ODT>", "7"}, {"\u00b1", "1,000"}}};
+    const Figure figure{svg::draw_chart({"t", "x", "y"}), "c", "t.svg"};
+    const std::vector<Section> sections{{"h", {"p < q", table, figure}, "as in the paper"}};
+    const std::string html = html_page("A & B", sections);
+    CHECK(html.starts_with("<!DOCTYPE html>"));
+    CHECK(well_formed(html));  // the style sheet has no tags, void elements are closed
+    CHECK_EQUAL(count(html, "&lt;ODT&gt;"), size_t{1});
+    CHECK_EQUAL(count(html, "<h1>A &amp; B</h1>\n<p>as in the paper</p>\n<h2>h</h2>\n<p>p &lt; q</p>"), size_t{1});
+    CHECK_EQUAL(count(html, figure.svg), size_t{1});
+    CHECK_EQUAL(page(Markdown{}, "A & B", sections),
+                "# A & B\n\nas in the paper\n\n## h\n\np < q\n\n"
+                "| method |  a\\|b |\n| ------ | ----: |\n| <ODT>  |     7 |\n| \u00b1      | 1,000 |\n\n"
+                "![](t.svg)\n\nc\n\n");
 }
 
-TEST(page_is_one_well_formed_file) {
-    const Table table{{"method", "a|b"}, {{"<ODT>", "7"}}};
-    const std::string page =
-        html_page("A & B", {{"h", {"p < q"}, {table}, {{line_chart({"t", "x", "y", {}, {}}), "c"}}}});
-    CHECK(page.starts_with("<!DOCTYPE html>"));
-    CHECK(well_formed(page));  // the style sheet has no tags, void elements are closed
-    CHECK_EQUAL(count(page, "&lt;ODT&gt;"), size_t{1});
-    CHECK_EQUAL(markdown_table(table), "| method | a\\|b |\n| --- | --- |\n| <ODT> | 7 |\n");
-}
-
-TEST(csv_errors_name_the_line) {
-    const Table table = parse_csv("step,loss\n0,\n1000,-1.5e-3\n", "progress.csv");
-    CHECK_EQUAL(table.rows.size(), size_t{2});
-    const std::vector<double> loss = numbers(table, "loss", "progress.csv");
-    CHECK(std::isnan(loss[0]) && loss[1] == -0.0015);
-    CHECK_FAILS("csv.column", numbers(table, "los", "progress.csv"));
-    CHECK_FAILS("csv.unfinished", parse_csv("", "f"));
-    CHECK_FAILS("csv.unfinished", parse_csv("a,b\n1,2", "f"));
-    CHECK_FAILS("csv.fields", parse_csv("a,b\n1\n", "f"));
-    CHECK_FAILS("csv.character", parse_csv("a,\"b\"\n", "f"));
-    CHECK_FAILS("csv.character", parse_csv("a,b\r\n", "f"));
-    CHECK_FAILS("csv.number", numbers(parse_csv("a\n1\n2x\n", "f"), "a", "f"));
-    try {
-        parse_csv("a,b\n1,2\n1,2,3\n", "progress.csv");
-    } catch (const Error& error) {
-        CHECK_EQUAL(std::string(error.what()), "progress.csv: line 3 has 3 fields, the header has 2");
-    }
+TEST(table_has_a_cell_for_each_column_of_each_row) {
+    const Table table = make_table<int>({1, 2}, {{"n", [](int n) { return std::to_string(n); }},
+                                                 {"n * n", [](int n) { return std::to_string(n * n); }}});
+    CHECK(table.header == (std::vector<std::string>{"n", "n * n"}));
+    CHECK(table.rows == (std::vector<std::vector<std::string>>{{"1", "1"}, {"2", "4"}}));
 }

@@ -95,7 +95,8 @@ TEST(a_diagonal_into_a_wall_does_what_the_edge_rule_says) {
 TEST(only_arriving_at_the_goal_pays_and_terminates) {
     for (int cell = 0; cell < grid_goal; ++cell) {
         for (int move = 0; move < grid_moves; ++move) {
-            GridWorld world{.cell = cell};
+            GridWorld world;
+            world.cell = cell;
             const float action = static_cast<float>(move);
             float state[grid_cells];  // room for either encoding
             const Step step = world.step(&action, state);
@@ -132,7 +133,8 @@ TEST(the_optimal_discounted_return_of_a_cell_is_gamma_to_the_steps_before_the_la
     for (int sweep = 0; sweep < grid_cells; ++sweep) {
         for (int cell = 0; cell < grid_goal; ++cell) {
             for (int move = 0; move < grid_moves; ++move) {
-                GridWorld world{.cell = cell};
+                GridWorld world;
+                world.cell = cell;
                 const float action = static_cast<float>(move);
                 float state[grid_cells];
                 const Step step = world.step(&action, state);
@@ -149,8 +151,8 @@ TEST(the_optimal_discounted_return_of_a_cell_is_gamma_to_the_steps_before_the_la
 }
 
 TEST(one_hot_and_coordinates_name_the_same_cells) {
-    const auto one_hot =
-        collect_data_set(GridWorld{.encoding = StateEncoding::one_hot}, Behaviour::right_down, default_data_seed, 20);
+    const GridWorld world(EdgeRule::clipped, StateEncoding::one_hot);
+    const auto one_hot = collect_data_set(world, Behaviour::right_down, default_data_seed, 20);
     for (size_t i = 0; i < one_hot.size(); ++i) {
         const Trajectory& coordinates = default_data_set()[i];
         CHECK(one_hot[i].actions == coordinates.actions);
@@ -160,7 +162,7 @@ TEST(one_hot_and_coordinates_name_the_same_cells) {
         CHECK(one_hot[i].states == expected);
     }
     CHECK_EQUAL(GridWorld{}.spec().state_dim, 2);
-    CHECK_EQUAL(GridWorld{.encoding = StateEncoding::one_hot}.spec().state_dim, 36);
+    CHECK_EQUAL(world.spec().state_dim, 36);
 }
 
 // WODTEM sec. IV-A test: 20% to two moves, 10% to each of the others
@@ -210,7 +212,7 @@ TEST(sampled_data_sets_agree_with_the_markov_chain) {
     constexpr int count = 20000;
     for (Behaviour behaviour : behaviours) {
         for (EdgeRule edge : edge_rules) {
-            const auto data_set = collect_data_set(GridWorld{.edge = edge}, behaviour, test_seed(), count);
+            const auto data_set = collect_data_set(GridWorld(edge), behaviour, test_seed(), count);
             const ChainStatistics chain = chain_statistics(behaviour, edge);
             CHECK_CLOSE(mean_length(data_set), chain.mean_length, 4 * chain.sd_length / std::sqrt(count));
             CHECK_CLOSE(mean_return(data_set), chain.mean_return, 4 * chain.sd_return / std::sqrt(count));

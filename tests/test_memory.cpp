@@ -4,6 +4,7 @@
 #include <numeric>
 #include <set>
 
+#include "../data/state.hpp"
 #include "../memory.hpp"
 #include "memory_bytes.hpp"
 #include "test.hpp"
@@ -179,55 +180,54 @@ void compare_with_naive(const MemoryConfig& config, int operations, uint32_t sal
 }
 
 // The entries in the tree are `inside`, each in one lane, with its coordinates and on its side of every plane above;
-// counts, parents and homes are right, every pair of nodes and every place is used or free, and no path is too long.
+// every node and every place is used once or free, leaves are not too empty and no path is too long.
 void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
-    const KdTree& tree = memory.tree;
-    std::vector<uint32_t> met, pairs = tree.free_pairs, places;
+    using Rank = std::pair<float, uint32_t>;  // (coordinate, entry), the order in which planes divide
     struct Box {
-        std::vector<float> low, high;
+        std::vector<Rank> low, high;  // [dim] the first rank inside, the first beyond
     };
-    const auto below = [&](const auto& self, uint32_t node, const Box& box, size_t depth) -> uint32_t {
-        const auto [child, dim, split, count] = tree.nodes[node];
-        CHECK(depth < KdTree::longest_path);
-        if (dim == KdTree::leaf) {
-            CHECK(count <= KdTree::lanes);
-            places.push_back(child);
-            for (uint32_t lane = 0; lane < count; ++lane) {
-                const uint32_t entry = tree.entries[child][lane];
-                met.push_back(entry);
-                CHECK_EQUAL(tree.home.at(entry), node);
-                for (size_t d = 0; d < memory.dim; ++d) {
-                    const float x = tree.coordinates[child * memory.dim + d][lane];
-                    CHECK_EQUAL(x, memory.projected[entry * memory.dim + d]);
-                    CHECK(box.low[d] <= x && x <= box.high[d]);
-                }
-            }
-            return count;
+    const KdTree& tree = memory.tree;
+    std::vector<uint32_t> met;
+    std::set<uint32_t> nodes, places;
+    size_t deepest = 0;
+    const auto below = [&](const auto& self, uint32_t node, const Box& box, size_t depth) -> void {
+        const auto [child, dim, split, number] = tree.nodes.at(node);
+        CHECK(nodes.insert(node).second);
+        deepest = std::max(deepest, depth);
+        if (dim != KdTree::leaf) {
+            Box low = box, high = box;
+            low.high[dim] = std::min(box.high[dim], Rank{split, number});
+            high.low[dim] = std::max(box.low[dim], Rank{split, number});
+            self(self, child, low, depth + 1);
+            self(self, child + 1, high, depth + 1);
+            return;
         }
-        CHECK(count > KdTree::lanes / 2);
-        CHECK_EQUAL(tree.parents[child / 2], node);
-        pairs.push_back(child / 2);
-        Box low = box, high = box;
-        low.high[dim] = std::min(box.high[dim], split);
-        high.low[dim] = std::max(box.low[dim], split);
-        const uint32_t in_low = self(self, child, low, depth + 1), in_high = self(self, child + 1, high, depth + 1);
-        CHECK_EQUAL(in_low + in_high, count);
-        CHECK(4 * std::max(in_low, in_high) <=
-              3 * count + 7);  // an insertion finds it out only when the next one comes
-        return count;
+        CHECK(number <= KdTree::lanes);
+        CHECK(places.insert(child).second);
+        for (uint32_t lane = 0; lane < number; ++lane) {
+            const uint32_t entry = tree.entries.at(child)[lane];
+            met.push_back(entry);
+            for (size_t d = 0; d < memory.dim; ++d) {
+                const Rank x = {tree.coordinates[child * memory.dim + d][lane], entry};
+                CHECK_EQUAL(x.first, memory.projected[entry * memory.dim + d]);
+                CHECK(box.low[d] <= x && x < box.high[d]);
+            }
+        }
     };
-    below(below, 0, {std::vector<float>(memory.dim, -INFINITY), std::vector<float>(memory.dim, INFINITY)}, 0);
-    const auto all_below = [](std::vector<uint32_t>& numbers, size_t n, uint32_t first) {  // first .. n - 1, each once
-        std::sort(numbers.begin(), numbers.end());
-        CHECK_EQUAL(numbers.size(), n - first);
-        for (size_t i = 0; i < numbers.size(); ++i) CHECK_EQUAL(numbers[i], i + first);
-    };
+    below(below, 0, {std::vector<Rank>(memory.dim, {-INFINITY, 0}), std::vector<Rank>(memory.dim, {INFINITY, 0})}, 0);
     std::sort(met.begin(), met.end());
     std::sort(inside.begin(), inside.end());
     CHECK(met == inside);
-    all_below(pairs, tree.parents.size(), 1);  // pair 0 holds the root
-    for (const uint32_t pair : tree.free_pairs) places.push_back(pair);
-    all_below(places, tree.parents.size(), 0);  // a free pair's place is free
+    CHECK_EQUAL(tree.size, inside.size());
+    CHECK_EQUAL(tree.nodes.size(), 2 * tree.entries.size());
+    CHECK_EQUAL(places.size(), tree.entries.size() - tree.free_pairs.size());
+    CHECK_EQUAL(nodes.size(), 2 * places.size() - 1);
+    for (const uint32_t pair : tree.free_pairs) CHECK(nodes.insert(2 * pair).second && places.insert(pair).second);
+    CHECK(4 * (tree.entries.size() - tree.free_pairs.size()) <= tree.size + KdTree::lanes);
+    // A tree was at most four times as large and a leaf when the deepest leaf was made.
+    const double largest = 4.0 * static_cast<double>(tree.size) + KdTree::lanes;
+    CHECK(static_cast<double>(deepest) <= std::log(largest / KdTree::lanes) / std::log(1.5) + 1);
+    CHECK(deepest <= KdTree::longest_path);
 }
 
 void check_tree(const EpisodicMemory& memory) {
@@ -285,7 +285,7 @@ void compare_with_plain(const EpisodicMemory& memory, uint64_t salt, uint32_t n 
     const Neighbourhoods found = memory.nearest(points, skipped);
     for (uint32_t i = 0; i < n; ++i) {
         const float* at = &points[i * memory.dim];
-        CHECK(same(found[i], memory.nearest_plain(at, skipped[i])));
+        CHECK(same(found[i], nearest_plain(memory, at, skipped[i])));
         if (i % 8 == 0) CHECK(same(found[i], memory.nearest({at, at + memory.dim}, {skipped[i]})[0]));
     }
 }
@@ -628,7 +628,7 @@ TEST(the_largest_states_overflow_to_infinite_distances_and_no_further) {
     for (const auto& state : {zero, low, high}) {
         std::vector<float> point(2);
         memory.project(state.data(), point.data());
-        CHECK(same(memory.nearest(point, {no_entry})[0], memory.nearest_plain(point.data(), no_entry)));
+        CHECK(same(memory.nearest(point, {no_entry})[0], nearest_plain(memory, point.data(), no_entry)));
     }
 }
 
@@ -694,10 +694,10 @@ TEST(approximate_return_weighs_by_exp_of_minus_squared_distance) {
     const float query = 0.125f;  // squared distances 1/64 and 9/64
     const auto found = search_and_count(memory, &query);
     const double a = std::exp(-1.0 / 64), b = std::exp(-9.0 / 64);
-    CHECK_CLOSE(memory.approximate_return(found), (a * 10 + b * 20) / (a + b), 1e-5);
-    CHECK_EQUAL(memory.approximate_return(std::span(found).first(1)), 10.0);
+    CHECK_CLOSE(approximate_return(memory, found), (a * 10 + b * 20) / (a + b), 1e-5);
+    CHECK_EQUAL(approximate_return(memory, std::span(found).first(1)), 10.0);
     const std::vector<Neighbour> far = {{400, 0}, {400, 1}};
-    CHECK_CLOSE(memory.approximate_return(far), 15.0, 1e-12);  // exp(-400) is 0 in float
+    CHECK_CLOSE(approximate_return(memory, far), 15.0, 1e-12);  // exp(-400) is 0 in float
 }
 
 // WODTEM eq. (6) test
@@ -735,7 +735,7 @@ TEST(weight_is_alpha_only_below_the_approximate_return) {
         CHECK_EQUAL(memory.weight(memory.is_optimal(found, std::nextafter(e, 1.0)), 0.9), 1.0);
         CHECK_EQUAL(memory.weight(memory.is_optimal(found, std::nextafter(e, 0.0)), 0.9), 0.9);
     }
-    const double mean = memory.approximate_return(far);
+    const double mean = approximate_return(memory, far);
     CHECK_EQUAL(memory.weight(memory.is_optimal(far, mean + 1e-9), 0.75), 1.0);
     CHECK_EQUAL(memory.weight(memory.is_optimal(far, mean - 1e-9), 0.75), 0.75);
     CHECK_EQUAL(memory.weight(memory.is_optimal(lone, 0.0), 0.0), 0.0);
@@ -760,13 +760,13 @@ TEST(a_loaded_memory_continues_like_the_one_that_was_saved) {
         };
         for (uint64_t i = 0; i < 3000; ++i) advance(saved, i);
         ToyArchive archive;
-        saved.visit(archive);
+        visit_memory(archive, saved);
         archive.loading = true;
-        loaded.visit(archive);
+        visit_memory(archive, loaded);
         for (uint64_t i = 3000; i < 6000; ++i) CHECK(same(advance(saved, i), advance(loaded, i)));
         ToyArchive first, second;
-        saved.visit(first);
-        loaded.visit(second);
+        visit_memory(first, saved);
+        visit_memory(second, loaded);
         CHECK(first.fields == second.fields && first.fields.size() == 9);
     }
 }
@@ -774,20 +774,22 @@ TEST(a_loaded_memory_continues_like_the_one_that_was_saved) {
 TEST(a_damaged_memory_is_refused) {
     EpisodicMemory memory = table_of(small(), {{1, 1, 1}, {2, 2, 2}, {3, 3, 3}});
     ToyArchive good;
-    memory.visit(good);
+    visit_memory(good, memory);
     good.loading = true;
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.e"].resize(16); memory.visit(bad));
+    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.e"].resize(16);
+                visit_memory(bad, memory));
     CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.e"][7] = 0x7F;
-                bad.fields["memory.e"][6] = 0xF0; memory.visit(bad));
+                bad.fields["memory.e"][6] = 0xF0; visit_memory(bad, memory));
     CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.keys"] = std::vector<unsigned char>(48);
-                memory.visit(bad));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 2; memory.visit(bad));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 9; memory.visit(bad));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.priority"][0] = 0; memory.visit(bad));
+                visit_memory(bad, memory));
+    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 2; visit_memory(bad, memory));
+    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 9; visit_memory(bad, memory));
+    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.priority"][0] = 0;
+                visit_memory(bad, memory));
     CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.projection"].resize(8);
-                memory.visit(bad));
+                visit_memory(bad, memory));
     memory.config.capacity = 2;
-    CHECK_FAILS("checkpoint.memory", memory.visit(good));
+    CHECK_FAILS("checkpoint.memory", visit_memory(good, memory));
 }
 
 TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
@@ -796,9 +798,9 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
     saved.trajectories[1].terminated = true;
     saved.add(with_return(2, 7));
     ToyArchive archive;
-    saved.visit(archive);
+    visit_replay(archive, saved);
     archive.loading = true;
-    loaded.visit(archive);
+    visit_replay(archive, loaded);
     for (ReplayBuffer* replay : {&saved, &loaded}) replay->add(with_return(9, 4));
     const Random random{test_seed(), Stream::batch};
     for (uint32_t i = 0; i < 100; ++i) {
@@ -809,8 +811,10 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
         CHECK(saved.trajectories[i].discounted_returns == loaded.trajectories[i].discounted_returns);
         CHECK(saved.trajectories[i].terminated == loaded.trajectories[i].terminated);
     }
-    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.lengths"][0] = 1; loaded.visit(bad));
-    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.next"][0] = 3; loaded.visit(bad));
+    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.lengths"][0] = 1;
+                visit_replay(bad, loaded));
+    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.next"][0] = 3;
+                visit_replay(bad, loaded));
     CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.states"].pop_back();
-                bad.fields["replay.states"].resize(4); loaded.visit(bad));
+                bad.fields["replay.states"].resize(4); visit_replay(bad, loaded));
 }

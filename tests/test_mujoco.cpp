@@ -397,7 +397,7 @@ TEST(the_table_of_tasks_agrees_with_the_models_and_the_reference_returns) {
         CHECK_EQUAL(std::string(task.name), expected[i].name);
         CHECK_EQUAL(spec.state_dim, expected[i].state_dim);
         CHECK_EQUAL(spec.action_dim, expected[i].action_dim);
-        CHECK_EQUAL(spec.moves, 0);
+        CHECK_EQUAL(spec.discrete_actions, 0);
         CHECK_EQUAL(spec.max_episode_steps, expected[i].limit);
         const int forces = task.rules == Rules::ant ? 6 * environment.model->nbody : 0;
         CHECK_EQUAL(spec.state_dim, environment.model->nq - task.first_position + environment.model->nv + forces);
@@ -669,9 +669,9 @@ TEST(the_place_on_the_map_is_a_whole_number_at_the_centre_of_a_cell) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Mechanics.
 
-// Motors, joint dampers and limits act between parts of the robot, so in the air its centre of mass falls freely and its
-// angular momentum stays. That is so of the exact motion; the integrator's error, as measured, goes with h^4,
-// but with h^2 for the ant, whose quaternion Runge-Kutta turns by the mean velocity alone.
+// Motors, joint dampers and limits act between parts of the robot, so in the air its centre of mass falls freely and
+// its angular momentum stays. That is so of the exact motion; the integrator's error, as measured, goes with h^4, but
+// with h^2 for the ant, whose quaternion Runge-Kutta turns by the mean velocity alone.
 TEST(in_the_air_momentum_is_conserved_whatever_the_motors_do) {
     for (const char* name : {"hopper", "walker2d", "ant"}) {
         for (const Physics physics : both_physics) {
@@ -870,7 +870,8 @@ TEST(step_is_advance_in_single_precision) {
     }
 }
 
-// Bit by bit. maze2d first brings the engine up to date under the old control, which in a corner shows in the last digits.
+// Bit by bit. maze2d first brings the engine up to date under the old control, which in a corner shows in the last
+// digits.
 TEST(an_action_lasts_its_number_of_engine_steps_and_nothing_follows_them) {
     for (const MujocoTask& task : mujoco_tasks) {
         const bool planar_walker = task.rules == Rules::hopper || task.rules == Rules::walker2d;
@@ -1018,7 +1019,8 @@ TEST(episodes_end_on_the_right_side_of_every_threshold) {
         for (const double value : threshold.goes_on) check(value, false);
         for (const double value : threshold.ends) check(value, true);
     }
-    // What is not a number ends an episode of those that look at it. It is written past start(): the engine would reset.
+    // What is not a number ends an episode of those that look at it. It is written past start(): the engine would
+    // reset.
     for (const auto& [name, ends] : std::initializer_list<std::pair<const char*, bool>>{
              {"hopper", true}, {"walker2d", true}, {"ant", true}, {"halfcheetah", false}}) {
         MujocoEnvironment environment = make(name);
@@ -1217,6 +1219,20 @@ TEST(an_action_that_is_not_finite_is_an_error) {
     }
 }
 
+// The engine calls its error handler where memory ends; the exception passes through its functions.
+TEST(a_simulation_without_memory_is_an_error_and_the_next_one_works) {
+    const MujocoEnvironment environment = make("hopper");
+    mju_user_malloc = [](size_t) -> void* { return nullptr; };
+    CHECK_FAILS("mujoco.engine", environment.clone());
+    mju_user_malloc = nullptr;
+    CHECK_FAILS("mujoco.memory", own_state(nullptr));
+    std::vector<float> action(3, 0.5f), state(11), expected(11);
+    MujocoEnvironment other = environment;
+    other.step(action.data(), expected.data());
+    environment.clone()->step(action.data(), state.data());
+    CHECK(state == expected);
+}
+
 TEST(what_the_engine_warns_of_is_an_error_that_names_task_and_step) {
     const Listener quiet;
     for (const MujocoTask& task : mujoco_tasks) {
@@ -1230,7 +1246,7 @@ TEST(what_the_engine_warns_of_is_an_error_that_names_task_and_step) {
             environment.advance(action);
             CHECK(!"an error");
         } catch (const Error& error) {
-            CHECK_EQUAL(error.id, "mujoco.unstable");
+            CHECK_EQUAL(error.id, "environment.unstable");
             CHECK(std::string(error.what()).find(std::string(task.name) + ": step 3: ") == 0);
         }
         environment.start(initial(environment), still(environment));  // and the next episode is sound
@@ -1250,8 +1266,8 @@ TEST(an_error_of_the_engine_is_an_error_of_ours_and_nothing_is_printed) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The published data.
 
-// D4RL's walker2d-random-v2: 10^6 steps of a uniformly random policy in 48908 episodes, mean return 1.871. The masses of
-// MuJoCo 2.2 make episodes longer by 0.64 steps. Hopper and ant cannot tell the two apart, walker2d can. The seed is
+// D4RL's walker2d-random-v2: 10^6 steps of a uniformly random policy in 48908 episodes, mean return 1.871. The masses
+// of MuJoCo 2.2 make episodes longer by 0.64 steps. Hopper and ant cannot tell the two apart, walker2d can. The seed is
 // fixed: of seeds 1 to 60, three put one of the four means on the wrong side of its bound.
 TEST(random_walkers_fall_as_in_d4rls_data_with_the_masses_of_its_time_alone) {
     constexpr uint32_t seed = 1;

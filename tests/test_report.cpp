@@ -43,14 +43,21 @@ std::string start_csv() {
     return out;
 }
 
-// A finished grid-world run; each evaluation is {interactions, length}.
+using Options = std::map<std::string, std::string>;
+
+// The file `settings` as training writes it; `options`: what the command line set.
+std::string settings_file(const std::string& task, const std::string& method, int seed, const Options& options) {
+    Settings settings = default_settings(task, method, "paper");
+    settings.seed = seed;
+    for (const auto& [name, value] : options) set_from(settings, name, value, "command line");
+    return settings_text(settings);
+}
+
+// A finished grid-world run with preset paper; each evaluation is {interactions, length}.
 std::string write_run(const std::string& parent, const std::string& method, int seed,
-                      const std::vector<std::pair<int, int>>& evaluations, const std::string& more_settings = "") {
+                      const std::vector<std::pair<int, int>>& evaluations, const Options& options = {}) {
     const std::string folder = parent + "/" + method + "-" + std::to_string(seed);
-    write(folder, "settings",
-          "task = gridworld    # command line\nmethod = " + method +
-              "  # command line\npreset = paper # command line\n" + "seed = " + std::to_string(seed) +
-              "   # command line\narithmetic = plain # the kernel\n" + more_settings);
+    write(folder, "settings", settings_file("gridworld", method, seed, options));
     std::string progress = "interactions,eval_length,eval_return,eval_score\n";
     for (const auto& [at, length] : evaluations)
         progress += std::to_string(at) + "," + std::to_string(length) + (length < 100 ? ",1,1\n" : ",0,0\n");
@@ -68,15 +75,21 @@ struct Evaluated {
     double length, total, score;
 };
 
+// What a MuJoCo task's settings say of the physics, the library and the data.
+struct Origin {
+    std::string physics = "d4rl", source = "chosen", mujoco = "2.2.2", dataset_source = "D4RL's published file";
+};
+
 // A finished run of a MuJoCo task with preset paper.
 std::string write_mujoco_run(const std::string& parent, const std::string& task, const std::string& method, int seed,
-                             const std::vector<Evaluated>& evaluations,
-                             const std::string& physics = "physics = d4rl # chosen\nmujoco = 2.2.2 # a\n") {
+                             const std::vector<Evaluated>& evaluations, const Origin& origin = {}) {
     const std::string folder = parent + "/" + task + "-" + method + "-" + std::to_string(seed);
-    write(folder, "settings",
-          "task = " + task + " # command line\nmethod = " + method +
-              " # command line\npreset = paper # command line\nseed = " + std::to_string(seed) + " # command line\n" +
-              physics);
+    Settings settings = default_settings(task, method, "paper");
+    settings.seed = seed;
+    set_from(settings, "physics", origin.physics, origin.source);
+    set_from(settings, "mujoco", origin.mujoco, "the library's version");
+    set_from(settings, "dataset", "a.hdf5", origin.dataset_source);
+    write(folder, "settings", settings_text(settings));
     std::string progress = "interactions,eval_length,eval_return,eval_score,physics\n";
     for (const Evaluated& e : evaluations)
         progress += std::to_string(e.interactions) + "," + std::to_string(e.length) + "," + std::to_string(e.total) +
@@ -102,6 +115,14 @@ bool equal(const std::vector<double>& got, const std::vector<double>& expected) 
     for (size_t i = 0; same && i < got.size(); ++i)
         same = got[i] == expected[i] || (std::isnan(got[i]) && std::isnan(expected[i]));
     return same;
+}
+
+// Several spaces become one, so that rows of aligned tables can be written here as they read.
+std::string narrow(const std::string& text) {
+    std::string out;
+    for (const char c : text)
+        if (out.empty() || c != ' ' || out.back() != ' ') out += c;
+    return out;
 }
 
 size_t count(const std::string& text, const std::string& part) {
@@ -150,6 +171,9 @@ TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
 TEST(resampling_takes_the_last_evaluation_at_or_before_each_point) {
     const Run run = run_with({0, 240, 250, 600, 760, 1010}, {50, 40, 30, 20, none, 10}, true);
     CHECK(equal(curve_points({Runs{&run}}), {0, 250, 500, 750, 1000}));
+    const Run offline = run_with({0}, {50}, true), long_one = run_with({200000}, {50}, true);
+    CHECK(equal(curve_points({Runs{&offline}}), {0, 250}));
+    CHECK_EQUAL(curve_points({Runs{&long_one}})[1], 500.0);
     // 760 has no value; 1010 is the final one and shows at the last point
     CHECK(equal(resampled(run, &Run::length, {0, 249, 250, 500, 750, 900, 1000}), {50, 40, 30, 30, 20, 20, 10}));
 }
@@ -158,10 +182,15 @@ TEST(unfinished_run_ends_where_it_stands_and_finished_one_keeps_its_last_value) 
     const Run open = run_with({0, 260}, {9, 8}, false), done = run_with({0, 260}, {9, 8}, true);
     CHECK(equal(resampled(open, &Run::length, {0, 250, 260, 500}), {9, 9, 8, none}));
     CHECK(equal(resampled(done, &Run::length, {0, 250, 260, 500}), {9, 9, 8, 8}));
-    std::vector<double> mean, deviation;
     const Run a = run_with({0, 1}, {4, 6}, true), b = run_with({0, 1}, {8, none}, true);
-    append_spread(mean, deviation, {&a, &b}, [](const Run& run) { return run.length; });
-    CHECK(equal(mean, {6, 6}) && equal(deviation, {std::sqrt(8.0), none}));
+    const svg::Series both = mean_series("", "", {&a, &b}, [](const Run& run) { return run.length; });
+    CHECK(equal(both.mean, {6, 6}) && equal(both.deviation, {std::sqrt(8.0), none}));
+}
+
+TEST(mean_of_last_ten_passes_over_missing_values) {
+    CHECK_CLOSE(last_ten(run_with({0}, {90, 1, 2, 3, 4, 5, none, 6, 7, 8, 9, 10}, true), &Run::length), 5.5, 1e-12);
+    CHECK_CLOSE(last_ten(run_with({0}, {4, 6}, true), &Run::length), 5, 0);
+    CHECK(std::isnan(last_ten(run_with({0}, {none}, true), &Run::length)));
 }
 
 TEST(length_five_counts_from_the_evaluation_after_which_it_never_left) {
@@ -172,7 +201,7 @@ TEST(length_five_counts_from_the_evaluation_after_which_it_never_left) {
 }
 
 TEST(each_length_falls_into_the_bar_whose_label_says_so) {
-    std::vector<double> counts(bin_ends.size(), 0);
+    std::vector<double> counts(bins.size(), 0);
     for (int length = 1; length <= 100; ++length) {
         const std::vector<double> one = count_lengths({static_cast<double>(length)});
         size_t found = 0;
@@ -181,8 +210,8 @@ TEST(each_length_falls_into_the_bar_whose_label_says_so) {
             if (one[bin] != 1) continue;
             ++found;
             int first = 0, last = 0;  // read back from the label
-            const int fields = std::sscanf(bin_label(bin).c_str(), "%d–%d", &first, &last);
-            if (fields == 0) CHECK(bin_label(bin) == "≤ 5" && length <= 5);
+            const int fields = std::sscanf(bins[bin].label, "%d–%d", &first, &last);
+            if (fields == 0) CHECK(std::string(bins[bin].label) == "≤ 5" && length <= 5);
             if (fields == 1) CHECK_EQUAL(length, first);
             if (fields == 2) CHECK(first <= length && length <= last);
         }
@@ -207,7 +236,7 @@ TEST(greedy_path_goes_to_the_goal_or_stops_at_a_loop) {
     for (size_t row = 0; row < 6; ++row) wall[row * 6 + 5] = always(4)[0];
     CHECK(greedy_path(wall, EdgeRule::clipped) == std::vector<int>({0, 1, 2, 3, 4, 5, 11, 17, 23, 29, 35}));
     CHECK(greedy_path(wall, EdgeRule::stays) == std::vector<int>({0, 1, 2, 3, 4, 5}));
-    CHECK_EQUAL(most_likely(MoveShares{0.2, 0.3, 0.3}), size_t{1});
+    CHECK_EQUAL(most_likely(MoveShares{0.2, 0.3, 0.3}), 1);
 }
 
 TEST(report_states_what_the_folders_hold) {
@@ -215,24 +244,28 @@ TEST(report_states_what_the_folders_hold) {
     std::vector<std::string> folders;
     for (const int seed : {2, 0, 1})
         folders.push_back(write_run(temporary.path, "wodtem", seed, {{0, 9}, {900 + seed, 5}, {1100, 5}},
-                                    "alpha = 0.5 # command line\n"));
+                                    {{"alpha", "0.5"}, {"arithmetic", "plain"}}));
     folders.push_back(write_run(temporary.path, "odt", 4, {{0, 100}, {1100, 7}}));
     folders.push_back(write_run(temporary.path, "odt", 0, {{0, 100}, {500, 100}}));
     std::filesystem::remove(folders.back() + "/finished");
     folders.push_back(write_run(temporary.path, "dt", 0, {{0, 14}}));
 
     const std::string out = temporary.path + "/out", text = report(folders, out);
-    const std::string page = read_file(out + "/report.html"), markdown = read_file(out + "/report.md");
-    for (const char* row :
-         {"| WODTEM | 3 | 5.00 ± 0.00 | 6.33 ± 0.00 | 1.00 ± 0.00 | 3 of 3 | 5 (sec. V-D) |",
-          "| ODT | 2 (1 unfinished) | 53.50 ± 65.76 | 76.75 ± 32.88 | 0.50 ± 0.71 | 0 of 2 | about 7 (sec. IV-A) |",
-          "| DT | 1 | 14.00 ± - | 14.00 ± - | 1.00 ± - | 0 of 1 | no number (fig. 4a) |",
-          "| WODTEM seed 2 | finished | 5.00 | 6.33 | 1.00 | 6 | 902 |",
-          "| ODT seed 0 | unfinished, at 500 | 100.00 | 100.00 | 0.00 | 6 | never |",
-          "| wodtem train gridworld --method wodtem --preset paper --seeds 0-2 --set alpha=0.5 | plain |",
-          "| wodtem train gridworld --method odt --preset paper --seed 4 | plain |"})
-        if (markdown.find(row) == std::string::npos) CHECK_EQUAL(row, "is not in " + markdown);
-    CHECK(text.find("5.00 ± 0.00") != std::string::npos);
+    const std::string page = read_file(out + "/report.html"), markdown = narrow(read_file(out + "/report.md"));
+    const std::string gridworld = "| wodtem train gridworld --method ";
+    for (const std::string& row : std::vector<std::string>{
+             "| Method | Seeds | Final length | Mean of last 10 | Paper | Final return |",
+             "| WODTEM | 3 | 5.00 ± 0.00 | 6.33 ± 0.00 | 5 (sec. V-D) | 1.00 ± 0.00 |",
+             "| ODT | 2 (1 unfinished) | 53.50 ± 65.76 | 76.75 ± 32.88 | about 7 (sec. IV-A) | 0.50 ± 0.71 |",
+             "| DT | 1 | 14.00 ± - | 14.00 ± - | no number (fig. 4a) | 1.00 ± - |",
+             "| Run | State | Interactions | Final length | Last 10 | Shortest met | At 5 from | Folder |",
+             "| WODTEM seed 2 | finished | 1,100 | 5.00 | 6.33 | 6 | 902 | " + folders[0] + " |",
+             "| ODT seed 0 | unfinished | 500 | 100.00 | 100.00 | 6 | - | " + folders[4] + " |",
+             gridworld + "wodtem --preset paper --seed 0 --set arithmetic=plain --set alpha=0.5 | plain |",
+             gridworld + "odt --preset paper --seed 4 | fused |"}) {
+        CHECK_CONTAINS(markdown, row);
+        CHECK_CONTAINS(narrow(text), row);
+    }
     for (const char* figure :
          {"length", "episodes", "start-odt", "start-wodtem", "grid-dt", "grid-odt", "grid-wodtem"}) {
         const std::string file = std::string("gridworld-paper-") + figure + ".svg",
@@ -241,8 +274,14 @@ TEST(report_states_what_the_folders_hold) {
         CHECK(markdown.find("![](" + file + ")") != std::string::npos);
         CHECK(svg_text.find("nan") == std::string::npos);
     }
-    CHECK(page.find("They reach G in 5 steps.") != std::string::npos);
-    CHECK(page.find("They do not reach G: after 5 steps") != std::string::npos);
+    CHECK_CONTAINS(page, "These moves reach G. Moves: 5. Moves off the grid: clipped.");
+    CHECK_CONTAINS(page, "These moves do not reach G, but return to a visited cell. Moves: 5.");
+    // The curve has three lines with bands, and the paper's marks of ODT and WODTEM; each has an entry in the legend.
+    const std::string curve = read_file(out + "/gridworld-paper-length.svg");
+    CHECK_EQUAL(count(curve, "fill-opacity"), size_t{3});
+    CHECK_EQUAL(count(curve, ">paper: "), size_t{2});
+    CHECK_EQUAL(count(curve, "stroke-dasharray"), size_t{2});  // DT's, and in the legend
+    CHECK_EQUAL(count(curve, ">DT<") + count(curve, ">ODT<") + count(curve, ">WODTEM<"), size_t{3});
 
     std::reverse(folders.begin(), folders.end());  // the order of the arguments does not matter
     report(folders, out);
@@ -264,33 +303,29 @@ TEST(grid_world_is_compared_with_the_paper_in_one_sentence) {
     const auto run = [&](const char* method, int seed, int length) {
         return write_run(temporary.path, method, seed, {{0, 50}, {900 + seed, length}});
     };
-    const std::string out = temporary.path + "/out", start = "gridworld, preset paper: ";
+    const std::string out = temporary.path + "/out", start = "gridworld, preset paper, final length: ";
     const std::string odt = run("odt", 0, 100), wodtem = run("wodtem", 0, 5);
-    check_verdict(
-        {odt, run("dt", 0, 14), wodtem}, out,
-        start +
-            "WODTEM takes 5.00 steps (return 1.00), the shortest path, which agrees with the paper: 5 (sec. V-D), "
-            "return 1; ODT takes 100.00 steps (return 0.00), never reaching the goal, which does not agree with "
-            "the paper: about 7 (sec. IV-A), return 1; DT takes 14.00 steps (return 1.00); the paper gives no "
-            "number (fig. 4a); online interactions: WODTEM 900, ODT 900, paper 20,000.");
+    check_verdict({odt, run("dt", 0, 14), wodtem}, out,
+                  start +
+                      "WODTEM 5.00, paper 5 (sec. V-D), agrees; ODT 100.00, paper about 7 (sec. IV-A), ours is higher; "
+                      "DT 14.00, paper no number (fig. 4a); online interactions: up to 900, paper 20,000.");
     // Seeds of 6 and 8 steps: mean 7, deviation sqrt(2). Seeds of 5 and 6 steps are not the paper's 5.
     check_verdict({run("odt", 0, 6), run("odt", 1, 8), wodtem, run("wodtem", 1, 6)}, out,
                   start +
-                      "WODTEM takes 5.50 ± 0.71 steps (return 1.00 ± 0.00), which does not agree with the paper: 5 "
-                      "(sec. V-D), return 1; ODT takes 7.00 ± 1.41 steps (return 1.00 ± 0.00), which agrees with the "
-                      "paper: about 7 (sec. IV-A), return 1; online interactions: WODTEM 900–901, ODT 900–901, "
-                      "paper 20,000.");
+                      "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher; ODT 7.00 ± 1.41, paper about 7 (sec. "
+                      "IV-A), agrees; online interactions: up to 901, paper 20,000.");
     // About 7 ends below 8 and above 6.
     for (const int length : {6, 8, 10})
         check_verdict({run("odt", 0, length)}, out,
-                      start + "ODT takes " + std::to_string(length) +
-                          ".00 steps (return 1.00), which does not agree with the paper: about 7 (sec. IV-A), return "
-                          "1; online interactions: ODT 900, paper 20,000.");
+                      start + "ODT " + std::to_string(length) + ".00, paper about 7 (sec. IV-A), ours is " +
+                          (length < 7 ? "lower" : "higher") + "; online interactions: up to 900, paper 20,000.");
     // Unfinished, and without an evaluation.
     std::filesystem::remove(odt + "/finished");
     write(odt, "progress.csv", "interactions,eval_length,eval_return,eval_score\n");
     check_verdict({odt}, out,
-                  start + "ODT (unfinished) has no result yet; online interactions: ODT 113, paper 20,000.");
+                  start +
+                      "ODT (unfinished) has no result yet, paper about 7 (sec. IV-A); online interactions: up to "
+                      "113, paper 20,000.");
 }
 
 TEST(scores_are_compared_with_table_three) {
@@ -301,44 +336,47 @@ TEST(scores_are_compared_with_table_three) {
         for (size_t method = 0; method < 3; ++method) {
             double sum = 0;
             for (size_t i = groups[group].first; i < groups[group].second; ++i)
-                sum += paper_scores[i].by_method[method].mean;
+                sum += paper_results[i].by_method[method].mean;
             CHECK_CLOSE(sum, printed[group][method], 1e-9);
         }
 
     const TemporaryFolder temporary;
-    const std::string out = temporary.path + "/out", d4rl = "physics = d4rl # chosen\nmujoco = 2.2.2 # a\n";
-    const auto run = [&](const char* task, const char* method, double score, const std::string& settings) {
-        return write_mujoco_run(temporary.path, task, method, 0, {{0, 300, 30, 1}, {4000, 300, 60, score}}, settings);
+    const std::string out = temporary.path + "/out";
+    const auto run = [&](const char* task, const char* method, double score, const Origin& origin = {}) {
+        return write_mujoco_run(temporary.path, task, method, 0, {{0, 300, 30, 1}, {4000, 300, 60, score}}, origin);
     };
-    const std::string task = "maze2d-umaze-v1", start = task + ", preset paper, physics d4rl: ";
+    const std::string task = "maze2d-umaze-v1", start = task + ", preset paper, physics d4rl, final normalised score: ";
     check_verdict(
-        {run("maze2d-umaze-v1", "dt", 27.7, d4rl + "dataset = a # not known as a published file\n"),
-         run("maze2d-umaze-v1", "odt", 39.32, d4rl), run("maze2d-umaze-v1", "wodtem", 64.38, d4rl)},
+        {run("maze2d-umaze-v1", "dt", 27.7, {"d4rl", "chosen", "2.2.2", "not known as a published file"}),
+         run("maze2d-umaze-v1", "odt", 39.32), run("maze2d-umaze-v1", "wodtem", 64.38)},
         out,
         start +
-            "WODTEM scores 64.38, below the paper's 75.18 ± 10.79; ODT scores 39.32, above the paper's 31.85 ± "
-            "7.46; DT scores 27.70, below the paper's 39.95 ± 12.17; online interactions: WODTEM 4,000, ODT "
-            "4,000, paper 200,000; the data set is not D4RL's file.");
-    check_verdict({run("maze2d-umaze-v1", "wodtem", 64.40, d4rl + "dataset = a # D4RL's published file\n")}, out,
-                  start +
-                      "WODTEM scores 64.40, within the paper's 75.18 ± 10.79; online interactions: WODTEM 4,000, "
-                      "paper 200,000.");
-    // A level of the data is part of the name; a task without a level, or unknown, is not in the table.
+            "WODTEM 64.38, paper 75.18 ± 10.79, ours is lower; ODT 39.32, paper 31.85 ± 7.46, ours is higher; "
+            "DT 27.70, paper 39.95 ± 12.17, ours is lower; online interactions: up to 4,000, paper 200,000; "
+            "the data set is not D4RL's file.");
+    CHECK_CONTAINS(narrow(read_file(out + "/report.md")), "| WODTEM | 1 | 64.38 ± - | 32.69 ± - | 75.18 ± 10.79 |");
+    CHECK_EQUAL(count(read_file(out + "/maze2d-umaze-v1-paper-score.svg"), ">paper: "), size_t{3});
     check_verdict(
-        {run("hopper-medium-replay-v2", "dt", 62.75, d4rl)}, out,
-        "hopper-medium-replay-v2, preset paper, physics d4rl: DT scores 62.75, within the paper's 62.75 ± 15.05.");
-    for (const char* other : {"hopper-v2", "elsewhere"})
-        CHECK(report({run(other, "wodtem", 50, d4rl)}, out).find("the paper") == std::string::npos);
+        {run("maze2d-umaze-v1", "wodtem", 64.40)}, out,
+        start + "WODTEM 64.40, paper 75.18 ± 10.79, agrees; online interactions: up to 4,000, paper 200,000.");
+    // A level of the data is part of the name; a task without a level is not in the table.
+    const std::string replay = write_mujoco_run(temporary.path, "hopper-medium-replay-v2", "dt", 0, {{0, 9, 9, 62.75}});
+    check_verdict(
+        {replay}, out,
+        "hopper-medium-replay-v2, preset paper, physics d4rl, final normalised score: DT 62.75, paper 62.75 ± "
+        "15.05, agrees.");
+    const std::string text = narrow(report({run("hopper-v2", "wodtem", 50)}, out));
+    CHECK_EQUAL(count(text, "normalised score: "), size_t{0});  // no sentence
+    CHECK_CONTAINS(text, "| WODTEM | 1 | 50.00 ± - | 25.50 ± - | - |");
 }
 
 TEST(report_of_a_run_that_has_just_begun_has_dashes) {
     const TemporaryFolder temporary;
-    write(temporary.path + "/run", "settings",
-          "task = gridworld # a\nmethod = odt # a\npreset = small # a\nseed = 3 # a\narithmetic = fused # a\n");
+    write(temporary.path + "/run", "settings", settings_file("gridworld", "odt", 3, {{"preset", "small"}}));
     report({temporary.path + "/run/"}, temporary.path + "/out");
-    const std::string markdown = read_file(temporary.path + "/out/report.md");
-    CHECK(markdown.find("| ODT | 1 (1 unfinished) | - | - | - | 0 of 1 |") != std::string::npos);
-    CHECK(markdown.find("| ODT seed 3 | unfinished, at 0 | - | - | - | - |") != std::string::npos);
+    const std::string markdown = narrow(read_file(temporary.path + "/out/report.md"));
+    CHECK_CONTAINS(markdown, "| ODT | 1 (1 unfinished) | - | - | about 7 (sec. IV-A) | - |");
+    CHECK_CONTAINS(markdown, "| ODT seed 3 | unfinished | 0 | - | - | - | - |");
 }
 
 TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
@@ -349,34 +387,21 @@ TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
             write_mujoco_run(temporary.path, "hopper-medium-v2", "odt", 1, {{0, 800, 1000, 40}, {5100, 700, 0, 50}}),
             write_mujoco_run(temporary.path, "hopper-medium-v2", "dt", 0, {{0, 500, 1500, 47}})},
            out);
-    const std::string page = read_file(out + "/report.md");
-    for (const char* part :
-         {"hopper-medium-v2, preset paper, physics d4rl\n",
-          "All runs: physics d4rl on MuJoCo 2.2.2, masses and inertias as in MuJoCo up to 2.1.0, which made D4RL's "
-          "data. Score 0 is a mean return of −20.27, score 100 one of 3,234.30.",
-          "Normalised score, as D4RL defines it", "| DT | 1 | 47.00 ± - | 47.00 ± - | 1,500.00 ± - | 500.00 ± - | 0 |",
-          // scores 70 and 50 (nan is passed over), means (61 + 70) / 2 and (40 + 50) / 2
-          "| ODT | 2 | 60.00 ± 14.14 | 55.25 ± 14.50 | 1,600.00 ± 2,262.74 | 850.00 ± 212.13 | 5,000–5,100 |",
-          "--method odt --preset paper --seeds 0-1 --physics d4rl |"})
+    const std::string page = narrow(read_file(out + "/report.md"));
+    for (
+        const char* part :
+        {"hopper-medium-v2, preset paper, physics d4rl\n",
+         "All runs: physics d4rl on MuJoCo 2.2.2, masses and inertias as in MuJoCo up to 2.1.0, which made D4RL's "
+         "data. Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (−20.27), 100 for an "
+         "expert (3,234.30). An episode ends when the body leaves gym's healthy range, or after 1,000 steps.",
+         "| DT | 1 | 47.00 ± - | 47.00 ± - | 61.03 ± 5.11 | 1,500.00 ± - | 500.00 ± - |",
+         // scores 70 and 50 (nan is passed over), means (61 + 70) / 2 and (40 + 50) / 2
+         "| ODT | 2 | 60.00 ± 14.14 | 55.25 ± 14.50 | 95.56 ± 3.53 | 1,600.00 ± 2,262.74 | 850.00 ± 212.13 |",
+         "| ODT seed 1 | finished | 5,100 | 50.00 | 45.00 | ", "--method odt --preset paper --seed 1 --physics d4rl |",
+         "![](hopper-medium-v2-paper-score.svg)"})
         CHECK_CONTAINS(page, part);
-    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-curve.svg"), ">normalised score<");
+    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-score.svg"), ">normalised score<");
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-length.svg"), ">evaluation length, steps<");
-}
-
-TEST(report_falls_back_to_returns_where_there_is_no_score) {
-    const TemporaryFolder temporary;
-    const std::string out = temporary.path + "/out";
-    report({write_mujoco_run(temporary.path, "ant-v2", "odt", 0, {{0, 900, 2000, none}})}, out);
-    CHECK_CONTAINS(read_file(out + "/report.md"), "| ODT | 1 | - | - | 2,000.00 ± - | 900.00 ± - | 100 |");
-    CHECK_CONTAINS(read_file(out + "/ant-v2-paper-curve.svg"), ">return<");
-
-    report({write_mujoco_run(temporary.path, "elsewhere", "odt", 0, {{0, 900, 2000, 3}, {200, 800, 1000, 4}}, "")},
-           out);
-    const std::string page = read_file(out + "/report.md");  // a task that this version does not know
-    CHECK_CONTAINS(page, "elsewhere, preset paper\n");
-    CHECK_CONTAINS(page, "| ODT | 1 | 4.00 ± - | 3.50 ± - | 1,000.00 ± - | 800.00 ± - | 200 |");
-    CHECK_CONTAINS(page, "![](elsewhere-paper-length.svg)");
-    CHECK(page.find("physics") == std::string::npos && page.find("D4RL") == std::string::npos);
 }
 
 TEST(physics_are_never_mixed) {
@@ -385,12 +410,12 @@ TEST(physics_are_never_mixed) {
     const auto run = [&](int seed, const std::string& physics, const std::string& source, const std::string& version) {
         const std::string parent = temporary.path + "/" + physics + source + version;
         return write_mujoco_run(parent, "walker2d-v2", "odt", seed, {{0, 900, 2000, 10.0 * seed}},
-                                "physics = " + physics + " # " + source + "\nmujoco = " + version + " # a\n");
+                                {physics, source, version});
     };
     const std::string a = run(1, "d4rl", "chosen", "2.2.2"), b = run(3, "d4rl", "command line", "2.2.2"),
                       c = run(5, "2.2", "command line", "2.2.2");
     report({a, b, c}, out);  // asked for or not, the same physics are the same
-    const std::string page = read_file(out + "/report.md");
+    const std::string page = narrow(read_file(out + "/report.md"));
     CHECK_CONTAINS(page, "walker2d-v2, preset paper, physics d4rl\n");
     CHECK_CONTAINS(page, "| ODT | 2 | 20.00 ± 14.14 |");
     CHECK_CONTAINS(page, "walker2d-v2, preset paper, physics 2.2\n");
@@ -398,11 +423,12 @@ TEST(physics_are_never_mixed) {
     CHECK_CONTAINS(page,
                    "physics 2.2 on MuJoCo 2.2.2, masses and inertias as MuJoCo 2.2 computes them from the geometry");
     CHECK_CONTAINS(page, "--seed 5 --physics 2.2 |");
-    CHECK_CONTAINS(page, "![](walker2d-v2-paper-curve.svg)");
-    CHECK_CONTAINS(page, "![](walker2d-v2-paper-physics-2.2-curve.svg)");
-    CHECK_FAILS("report.mujoco", report({a, run(7, "d4rl", "chosen", "2.2.1")}, out));
+    CHECK_CONTAINS(page, "![](walker2d-v2-paper-score.svg)");
+    CHECK_CONTAINS(page, "![](walker2d-v2-paper-physics-2.2-score.svg)");
+    CHECK_FAILS("report.mixed", report({a, run(7, "d4rl", "chosen", "2.2.1")}, out));
     CHECK_FAILS("report.setting", report({run(1, "none", "a", "2.2.2")}, out));
-    CHECK_FAILS("report.setting", report({run(1, "d4rl", "a", "2/2")}, out));
+    report({run(1, "d4rl", "a", "<2/2>")}, out);  // any text, since only sentences hold it
+    CHECK_CONTAINS(read_file(out + "/report.html"), "on MuJoCo &lt;2/2&gt;,");
 }
 
 TEST(report_draws_the_paths_through_a_maze) {
@@ -429,11 +455,12 @@ TEST(report_draws_the_paths_through_a_maze) {
     CHECK_CONTAINS(maze, "<circle cx=\"211.2\" cy=\"239.2\" r=\"48\"");  // observed (1, 1) is (1.2, 1.2)
     CHECK_CONTAINS(maze, "goal (radius 0.5 m)");
     CHECK_EQUAL(count(maze, "#C8C8C8"), size_t{18});  // 25 cells, 7 free
+    CHECK_EQUAL(count(maze, "r=\"48\""), size_t{1});  // one goal for all episodes
     CHECK_CONTAINS(page, "![](maze2d-umaze-v1-paper-paths-odt.svg)");
     CHECK_CONTAINS(
         page,
-        "ODT seed 1, unfinished: its latest evaluation, at 20,050 online interactions, physics d4rl on MuJoCo "
-        "2.2.2. 1 of 3 episodes came within 0.5 m of the goal at some time. None ends there: the score counts");
+        "The latest evaluation of ODT seed 1, unfinished: 1 of 3 episodes came within 0.5 m of the goal at some time. "
+        "None ends there: the score counts the steps within that distance.");
     CHECK(page.find("paths-dt") == std::string::npos);
     CHECK(page.find("-length.svg") == std::string::npos);  // every episode takes 300 steps
     CHECK_CONTAINS(page, "Every episode takes 300 steps.");
@@ -475,15 +502,18 @@ TEST(paths_that_cannot_be_are_refused_with_their_line) {
     fails("csv.unfinished", head + "0,2,7,9,1", "line 4 ");
     fails("csv.column", "episode,step,goal_x,goal_y,x\n", "line 1 ");
     fails("csv.fields", head + "0,2,7,9,1\n", "line 4 ");
-    fails("csv.number", head + "0,2,7,9,1,y\n", "line 4: ");
-    for (const char* row : {"0,3,7,9,1,1", "0,1,7,9,1,1", "1,2,7,9,1,1", "0,0,7,9,1,1", "2,0,7,9,1,1", "0,1.5,7,9,1,1",
-                            "nan,2,7,9,1,1", "-1,0,7,9,1,1"})
-        fails("report.order", head + row + "\n", "line 4: ");
-    fails("report.order", "episode,step,goal_x,goal_y,x,y\n0,1,7,9,1,1\n", "line 2: ");
-    for (const char* row : {"0,nan,7,9,1,1", "0,801,7,9,1,1", "0,2,7,9,nan,1", "0,2,7,9,1,inf", "0,2,7,9,-10,1",
-                            "0,2,7,9,1,24", "0,2,7,nan,1,1", "0,2,1e300,9,1,1"})
-        fails("report.range", head + row + "\n", "line 4: ");
-    fails("report.goal", head + "0,2,7,9.5,1,1\n", "line 4: ");
+    for (const char* row : {"0,2,7,9,1,y", "0,2,7,9,1,", "0,2,7,9,1,1\r", "0,2,7,9,1,\"1\"", "nan,2,7,9,1,1",
+                            "-1,0,7,9,1,1", "0,nan,7,9,1,1", "0,801,7,9,1,1", "0,2,7,9,nan,1", "0,2,7,9,1,inf",
+                            "0,2,7,9,-1001,1", "0,2,7,nan,1,1", "0,2,1e300,9,1,1"})
+        fails("csv.number", head + row + "\n", "line 4: column ");
+    for (const char* row :
+         {"0,3,7,9,1,1", "0,1,7,9,1,1", "1,2,7,9,1,1", "0,0,7,9,1,1", "2,0,7,9,1,1", "0,1.5,7,9,1,1", "0,2,7,9.5,1,1"})
+        fails("csv.order", head + row + "\n", "line 4: ");
+    fails("csv.order", "episode,step,goal_x,goal_y,x,y\n0,1,7,9,1,1\n", "line 2: ");
+    write(run, "paths.csv", head + "0,2,7,9,-900,900\n");  // a simulation may throw the body out of the maze
+    report({run}, temporary.path + "/out");
+    const std::string svg = read_file(temporary.path + "/out/maze2d-large-v1-paper-paths-odt.svg");
+    CHECK_CONTAINS(svg, " 648 76 \"");  // the map's upper right corner
 
     const std::string hopper = write_mujoco_run(temporary.path, "hopper-v2", "odt", 0, {{0, 800, 30, 4.5}});
     write(hopper, "paths.csv", "not of a maze");  // and so not looked at
@@ -496,8 +526,7 @@ TEST(report_names_each_way_a_folder_can_be_wrong) {
     CHECK_FAILS("report.nothing", report({}, out));
     CHECK_FAILS("report.folder", report({temporary.path}, out));
     CHECK_FAILS("report.same_seed", report({good, good + "/"}, out));
-    CHECK_FAILS("report.options",
-                report({good, write_run(temporary.path, "odt", 1, {{0, 9}}, "K = 2 # command line\n")}, out));
+    CHECK_FAILS("report.mixed", report({good, write_run(temporary.path, "odt", 1, {{0, 9}}, {{"K", "2"}})}, out));
     CHECK_FAILS("report.write", report({good}, good + "/settings/out"));
 
     // One file is replaced at a time; every other one is good.
@@ -509,22 +538,53 @@ TEST(report_names_each_way_a_folder_can_be_wrong) {
     };
     const std::string settings = read_file(good + "/settings"), policy = policy_csv("R"), start = start_csv();
     fails("settings.line", "settings", settings + "x\n");
-    fails("report.setting", "settings", settings.substr(settings.find('\n') + 1));  // no task
-    fails("report.setting", "settings", "task = ../x # a\nmethod = odt # a\npreset = p # a\nseed = 1 # a\n");
-    fails("report.setting", "settings", "task = x # a\nmethod = sac # a\npreset = p # a\nseed = 1 # a\n");
-    fails("report.setting", "settings", "task = x # a\nmethod = odt # a\npreset = p # a\nseed = 1x # a\n");
-    fails("report.setting", "settings", settings + "edge = round # a\n");
+    fails("settings.missing", "settings", settings.substr(settings.find('\n') + 1));  // no task
+    const auto spoilt = [&](const char* name, const char* value) {
+        const size_t at = settings.find(" = ", settings.find(std::string(name) + " = ")) + 3;
+        return std::string(settings).replace(at, settings.find(' ', at) - at, value);
+    };
+    fails("settings.value", "settings", spoilt("task", "../x"));
+    fails("settings.value", "settings", spoilt("method", "sac"));
+    fails("settings.value", "settings", spoilt("seed", "1x"));
+    fails("settings.value", "settings", spoilt("edge", "round"));
     fails("csv.unfinished", "progress.csv", "interactions,eval_length,eval_return,eval_score\n0,9,1,1");
     fails("csv.fields", "progress.csv", "interactions,eval_length,eval_return,eval_score\n0,9,1\n");
     fails("csv.number", "progress.csv", "interactions,eval_length,eval_return,eval_score\n0,9,1,x\n");
     fails("csv.column", "progress.csv", "interactions,eval_length,eval_return\n0,9,1\n");
-    fails("report.order", "progress.csv", "interactions,eval_length,eval_return,eval_score\n9,9,1,1\n8,9,1,1\n");
-    fails("report.range", "progress.csv", "interactions,eval_length,eval_return,eval_score\nnan,9,1,1\n");
-    fails("report.range", "episodes.csv", "interactions,length,return\n101,101,0\n");
-    fails("report.range", "policy.csv", std::string(policy).replace(policy.find("0.65"), 4, "1.65"));
-    fails("report.rows", "policy.csv", policy + "6,0,1,0,0,0,0,0,0,0\n");
-    fails("report.rows", "policy.csv", policy.substr(0, policy.rfind("\n5,5") + 1));
-    fails("report.rows", "start_actions.csv", std::string(start).replace(start.find("\nD,"), 3, "\nX,"));
+    fails("csv.order", "progress.csv", "interactions,eval_length,eval_return,eval_score\n9,9,1,1\n8,9,1,1\n");
+    fails("csv.number", "progress.csv", "interactions,eval_length,eval_return,eval_score\nnan,9,1,1\n");
+    fails("csv.number", "episodes.csv", "interactions,length,return\n101,101,0\n");
+    fails("csv.number", "policy.csv", std::string(policy).replace(policy.find("0.65"), 4, "1.65"));
+    fails("csv.rows", "policy.csv", policy + "6,0,1,0,0,0,0,0,0,0\n");
+    fails("csv.rows", "policy.csv", policy.substr(0, policy.rfind("\n5,5") + 1));
+    fails("csv.rows", "start_actions.csv", std::string(start).replace(start.find("\nD,"), 3, "\nX,"));
     std::filesystem::remove(good + "/policy.csv");  // finished, so it must be there
     CHECK_FAILS("file.open", report({good}, out));
+}
+
+TEST(csv_errors_name_the_line) {
+    const TemporaryFolder temporary;
+    const std::string path = temporary.path + "/progress.csv";
+    write_file_atomic(path, "step,loss\n0,nan\n1000,-1.5e-3\n");
+    const Log log(path);
+    CHECK_EQUAL(log.table.rows.size(), size_t{2});
+    CHECK(equal(log.numbers("loss", -1, 0, true), {none, -0.0015}));
+    CHECK_FAILS("csv.number", log.numbers("loss", -1, 0));
+    CHECK_FAILS("csv.number", log.numbers("step", 0, 999));
+    CHECK_FAILS("csv.column", log.numbers("los", 0, 1));
+    CHECK_FAILS("csv.unfinished", parse_csv("", "f"));
+    CHECK_FAILS("csv.unfinished", parse_csv("a,b\n1,2", "f"));
+    CHECK_FAILS("csv.fields", parse_csv("a,b\n1\n", "f"));
+    CHECK_FAILS("csv.fields", parse_csv("a,b\n\n", "f"));
+    try {
+        parse_csv("a,b\n1,2\n1,2,3\n", "progress.csv");
+    } catch (const Error& error) {
+        CHECK_EQUAL(std::string(error.what()), "progress.csv: line 3 has 3 fields, the header has 2");
+    }
+    try {
+        log.numbers("step", 0, 999);
+    } catch (const Error& error) {
+        CHECK_EQUAL(std::string(error.what()),
+                    path + ": line 3: column \"step\" holds \"1000\", expected a number from 0 to 999");
+    }
 }

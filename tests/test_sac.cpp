@@ -1,4 +1,5 @@
-// test_sac.cpp: data/sac.hpp against finite differences, plain loops, closed forms and tasks whose best return is known.
+// test_sac.cpp: data/sac.hpp against finite differences, plain loops, closed forms and tasks whose best return is
+// known.
 //
 // In order: replay; the policy's distribution; the losses and the target; learning; stopping and resuming; files.
 #include <unistd.h>
@@ -32,7 +33,7 @@ struct TemporaryFile {
 struct Draws {
     uint64_t test;
     uint32_t count = 0;
-    float normal() { return Random{test_seed(), 1000}.normal(test, count++); }
+    float normal() { return Random{test_seed(), Stream::data_set}.normal(test, count++); }
     std::vector<float> normals(size_t n) {
         std::vector<float> x(n);
         for (float& value : x) value = normal();
@@ -73,7 +74,7 @@ struct Tiny {
             const auto state = draws.normals(3), next_state = draws.normals(3);
             const std::vector<float> action = {std::tanh(draws.normal()), std::tanh(draws.normal())};
             const sac::End end = i == 2 ? sac::End::terminated : i == 4 ? sac::End::cut : sac::End::none;
-            replay.add(state.data(), action.data(), draws.normal(), end, next_state.data());
+            replay.add(state.data(), action.data(), draws.normal(), end, next_state.data(), 0);
         }
         noise = draws.normals(2 * rows);
         next_noise = draws.normals(2 * rows);
@@ -132,7 +133,8 @@ TEST(sac_replay_is_a_ring_that_keeps_the_newest) {
     sac::Replay replay{2, 1, 4};
     for (int i = 0; i < 6; ++i) {
         const float x = static_cast<float>(i), state[2] = {x, -x}, next_state[2] = {x + 0.5f, -x - 0.5f};
-        replay.add(state, &x, 10 * i, i == 3 ? sac::End::terminated : sac::End::none, next_state);
+        replay.add(state, &x, 10 * i, i == 3 ? sac::End::terminated : sac::End::none, next_state,
+                   static_cast<uint64_t>(100 + i / 4));
         CHECK_EQUAL(replay.size(), static_cast<size_t>(std::min(i + 1, 4)));
         CHECK_EQUAL(replay.row(replay.recent(1))[0], x);
     }
@@ -145,6 +147,7 @@ TEST(sac_replay_is_a_ring_that_keeps_the_newest) {
         CHECK_EQUAL(replay.action(row)[0], x);
         CHECK_EQUAL(replay.reward(row), 10 * x);
         CHECK_EQUAL(replay.next_state(row)[1], -x - 0.5f);
+        CHECK_EQUAL(replay.episode(row), x < 4 ? uint64_t{100} : uint64_t{101});
         CHECK(replay.end(row) == (x == 3 ? sac::End::terminated : sac::End::none));
     }
     replay.cut_last();
@@ -237,12 +240,11 @@ TEST(sac_gradient_of_the_policy_loss_equals_central_differences) {
     Tiny tiny;
     const Loss loss = [&](Tape<double>& tape) {
         const auto batch = tiny.batch(tape);
-        const auto sample = sac::draw(tape, sac::forward(tape, tiny.policy, batch.states).output, tiny.noise.data());
+        const auto sample = sac::draw(tape, sac::forward(tape, tiny.policy, batch.states), tiny.noise.data());
         return sac::policy_loss(tape, tiny.critics, batch.states, sample, 0.3);
     };
     Tape<double> tape(one_thread());
-    const auto sample =
-        sac::draw(tape, sac::forward(tape, tiny.policy, tiny.batch(tape).states).output, tiny.noise.data());
+    const auto sample = sac::draw(tape, sac::forward(tape, tiny.policy, tiny.batch(tape).states), tiny.noise.data());
     std::vector<double> q0, excess;  // of the first critic over the second
     for (size_t i = 0; i < Tiny::rows; ++i) {
         std::vector<double> x(tiny.replay.row(i), tiny.replay.row(i) + 3);
@@ -322,40 +324,57 @@ namespace {
 
 // A point on a line: x' = x + a / 2 costs x'^2; from |x| <= 1/2 the goal, 0, is one step away, from elsewhere two.
 // Optionally the engine fails at a step, or the task ends when the point has left [-3, 3].
-struct Rail {
-    int limit = 5;
+struct Rail : Environment {
+    int limit;
     int fails_at = 0;  // step of each odd episode
-    const char* fails_with = "mujoco.unstable";
+    const char* fails_with = "environment.unstable";
     bool bounded = false;
     double x = 0;
     int steps = 0;
     bool odd = false;
 
-    EnvironmentSpec spec() const { return {1, 1, 0, limit}; }
-    void reset(const Random& random, uint64_t episode, float* state) {
+    explicit Rail(int time_limit = 5) : limit(time_limit) {}
+    EnvironmentSpec spec() const override { return {1, 1, 0, limit}; }
+    void reset(const Random& random, uint64_t episode, float* state) override {
         x = 2 * random.uniform(episode, 0) - 1;
         steps = 0;
         odd = episode % 2 == 1;
         *state = static_cast<float>(x);
     }
-    Step step(const float* action, float* state) {
+    Step step(const float* action, float* state) override {
         if (++steps == fails_at && odd) fail(fails_with, "the engine fails");
         x += static_cast<double>(*action) / 2;
         *state = static_cast<float>(x);
         return {-x * x, bounded && std::fabs(x) > 3};
     }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Rail>(*this); }
 };
 
 // One action and the end: pays 1 - (a - 0.6)^2.
-struct Bandit {
-    EnvironmentSpec spec() const { return {1, 1, 0, 10}; }
-    void reset(const Random&, uint64_t, float* state) { *state = 1; }
-    Step step(const float* action, float* state) {
+struct Bandit : Environment {
+    EnvironmentSpec spec() const override { return {1, 1, 0, 10}; }
+    void reset(const Random&, uint64_t, float* state) override { *state = 1; }
+    Step step(const float* action, float* state) override {
         *state = 1;
         const double miss = static_cast<double>(*action) - 0.6;
         return {1 - miss * miss, true};
     }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Bandit>(*this); }
 };
+
+// Mean return of `count` episodes of the learner's policy, numbered from first_episode, leaving out those in which the
+// simulation broke down.
+double evaluate(sac::Learner& learner, Environment& environment, uint64_t first_episode, uint64_t count, bool sampled) {
+    sac::Actor actor{learner.acting, learner.policy, test_seed(), sampled};
+    double total = 0, sound = 0;
+    for (uint64_t i = 0; i < count; ++i) {
+        const Episode episode = actor.play(environment, first_episode + i);
+        if (!episode.error.empty()) continue;
+        total += episode.total_reward;
+        sound += 1;
+    }
+    return total / sound;
+}
 
 sac::Settings small_settings() {
     sac::Settings settings;
@@ -385,12 +404,10 @@ TEST(sac_learns_a_task_whose_best_return_is_known) {
         const double left = std::max(std::fabs(static_cast<double>(x)) - 0.5, 0.0);
         best -= left * left / episodes;
     }
-    const double found =
-        sac::evaluate(learner.acting, learner.policy, evaluation, test_seed(), 1000000, episodes, false);
+    const double found = evaluate(learner, evaluation, 1000000, episodes, false);
     CHECK(found <= best + 1e-9);
     CHECK_CLOSE(found, best, 0.02);  // without learning: about -2
-    const double sampled =
-        sac::evaluate(learner.acting, learner.policy, evaluation, test_seed(), 1000000, episodes, true);
+    const double sampled = evaluate(learner, evaluation, 1000000, episodes, true);
     CHECK(sampled < found && sampled > -0.4);
     CHECK_CLOSE(learner.last.entropy, -1, 0.5);  // the temperature holds the entropy at -dim A
 }
@@ -535,16 +552,15 @@ TEST(sac_updates_at_every_nth_step_once_acting_at_random_is_over) {
 namespace {
 
 // `steps` steps, stopped and resumed after the first `stop` where that is not 0: the bytes of the checkpoint.
-template <class Environment>
 std::string run_bytes(const sac::Settings& settings, const Environment& fresh, int steps, int stop, Compute& compute) {
     TemporaryFile file("run");
     auto learner = std::make_unique<sac::Learner>(settings, fresh.spec(), compute);
-    auto environment = std::make_unique<Environment>(fresh);
+    auto environment = fresh.clone();
     for (int i = 0; i < steps; ++i) {
         if (i == stop && stop > 0) {
             sac::save_checkpoint(file.path, *learner, "task=line");
             learner = std::make_unique<sac::Learner>(settings, fresh.spec(), compute);
-            environment = std::make_unique<Environment>(fresh);
+            environment = fresh.clone();
             sac::load_checkpoint(file.path, *learner, "task=line");
             learner->resume(*environment);
         }
@@ -669,22 +685,22 @@ TEST(sac_played_episode_is_a_function_of_seed_and_number) {
     Rail environment;
     environment.fails_at = 3;
     sac::Learner learner(small_settings(), environment.spec(), one_thread());
-    int calls = 0;
-    const auto play = [&](uint64_t number, bool sampled) {
-        calls = 0;
-        return sac::play(learner.acting, learner.policy, environment, test_seed(), number, sampled, [&] {
-            CHECK_EQUAL(environment.steps, calls);  // before the step
-            ++calls;
-        });
-    };
-    const sac::Episode a = play(4, true), again = play(4, true), mean = play(4, false), spoiled = play(5, true);
-    CHECK_EQUAL(a.rewards.size(), size_t{5});
-    CHECK(a.actions == again.actions && a.states == again.states && a.log_probs == again.log_probs);
-    CHECK(a.actions != mean.actions && a.states[0] == mean.states[0]);
-    CHECK(!a.terminated && !a.spoiled && spoiled.spoiled);
+    sac::Actor actor{learner.acting, learner.policy, test_seed()};
+    const Episode a = actor.play(environment, 4);
+    const std::vector<float> log_probs = actor.log_probs;
+    const Episode again = actor.play(environment, 4);
+    CHECK_EQUAL(a.trajectory.rewards.size(), size_t{5});
+    CHECK(a.trajectory.actions == again.trajectory.actions && a.trajectory.states == again.trajectory.states);
+    CHECK(log_probs.size() == 5 && actor.log_probs == log_probs);
+    const Episode failed = actor.play(environment, 5);
+    CHECK(!a.trajectory.terminated && a.error.empty() && !failed.error.empty());
+    CHECK_EQUAL(failed.trajectory.length(), 3);
+    actor.sampled = false;
+    const Episode mean = actor.play(environment, 4);
+    CHECK(a.trajectory.actions != mean.trajectory.actions && a.trajectory.states[0] == mean.trajectory.states[0]);
     double total = 0;
-    for (const float reward : a.rewards) total += static_cast<double>(reward);
-    CHECK_CLOSE(total, a.total, 1e-5);
-    CHECK(std::isnan(sac::evaluate(learner.acting, learner.policy, environment, test_seed(), 5, 1, true)));
-    CHECK_EQUAL(sac::evaluate(learner.acting, learner.policy, environment, test_seed(), 4, 2, true), a.total);
+    for (const float reward : a.trajectory.rewards) total += static_cast<double>(reward);
+    CHECK_CLOSE(total, a.total_reward, 1e-5);
+    CHECK(std::isnan(evaluate(learner, environment, 5, 1, true)));
+    CHECK_EQUAL(evaluate(learner, environment, 4, 2, true), a.total_reward);
 }

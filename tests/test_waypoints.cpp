@@ -21,7 +21,8 @@ Lines lines_of(const MujocoTask& task) {
     return lines;
 }
 
-// Steps from every cell to the target by breadth-first search, -1 where there is no way. Walls can be left, not entered.
+// Steps from every cell to the target by breadth-first search, -1 where there is no way. Walls can be left, not
+// entered.
 std::vector<std::vector<int>> distances(const Lines& lines, size_t row, size_t column) {
     std::vector<std::vector<int>> steps(lines.size(), std::vector<int>(lines[0].size(), -1));
     std::deque<std::pair<size_t, size_t>> queue{{row, column}};
@@ -224,7 +225,7 @@ TEST(a_plan_is_made_when_the_rounded_target_changes) {
     controller.at = 3;
     controller.act({3.05, 1.02}, {0, 0}, {1.1, 2.9});
     CHECK(controller.plans == 2 && controller.at == 3);
-    controller.forget();
+    controller.target.reset();
     controller.act({3.05, 1.02}, {0, 0}, {1.1, 2.9});
     CHECK(controller.plans == 3 && controller.at == 0);
 }
@@ -236,19 +237,19 @@ TEST(a_plan_is_made_when_the_rounded_target_changes) {
 namespace {
 
 constexpr size_t large_set = 100000;
-const MazeDataSet& umaze_set() {
-    static const MazeDataSet set = collect_maze_data_set(task_of("maze2d-umaze"), large_set, test_seed());
+const CollectedRows<float>& umaze_set() {
+    static const CollectedRows<float> set = collect_maze_data_set(task_of("maze2d-umaze"), large_set, test_seed());
     return set;
 }
 
-bool equal(const MazeDataSet& a, const MazeDataSet& b) {
+bool equal(const CollectedRows<float>& a, const CollectedRows<float>& b) {
     return a.observations == b.observations && a.actions == b.actions && a.rewards == b.rewards &&
            a.terminals == b.terminals && a.timeouts == b.timeouts && a.goal == b.goal && a.qpos == b.qpos &&
            a.qvel == b.qvel;
 }
 
 // Everything that a row and its neighbours must satisfy; counts the trajectories that were given up.
-int check_set(const MazeDataSet& set, const MujocoTask& task) {
+int check_set(const CollectedRows<float>& set, const MujocoTask& task) {
     const Lines lines = lines_of(task);
     const size_t n = set.length(), limit = static_cast<size_t>(task.max_episode_steps);
     CHECK(set.observations.size() == 4 * n && set.actions.size() == 2 * n && set.terminals.size() == n);
@@ -265,7 +266,7 @@ int check_set(const MazeDataSet& set, const MujocoTask& task) {
         CHECK(set.qpos[2 * t] == o[0] && set.qpos[2 * t + 1] == o[1]);
         CHECK(set.qvel[2 * t] == o[2] && set.qvel[2 * t + 1] == o[3]);
         CHECK_EQUAL(set.rewards[t], std::hypot(x - goal_row, y - goal_column) <= 0.5 ? 1.0f : 0.0f);
-        CHECK_EQUAL(set.terminals[t], 0.0f);
+        CHECK_EQUAL(set.terminals[t], 0);
         CHECK(std::fabs(set.actions[2 * t]) <= 1 && std::fabs(set.actions[2 * t + 1]) <= 1);
         const float row = std::round(target[0]), column = std::round(target[1]);
         CHECK(lines[static_cast<size_t>(row)][static_cast<size_t>(column)] != '1');
@@ -275,7 +276,7 @@ int check_set(const MazeDataSet& set, const MujocoTask& task) {
         ++run;
         const double distance = std::hypot(x - static_cast<double>(row), y - static_cast<double>(column));
         const bool reached = distance < 0.1;
-        if (std::fabs(distance - 0.1) > 1e-6) CHECK_EQUAL(set.timeouts[t], reached || run > limit ? 1.0f : 0.0f);
+        if (std::fabs(distance - 0.1) > 1e-6) CHECK_EQUAL(set.timeouts[t], reached || run > limit ? 1 : 0);
         given_up += run > limit && !reached;
         CHECK(run <= limit + 1);
         if (set.timeouts[t] == 1) run = 0;
@@ -320,13 +321,13 @@ TEST(maze_targets_are_drawn_from_all_open_cells_alike) {
 // noise there are 13626, in this tenth of the rows four standard deviations away.
 TEST(umaze_data_have_as_many_timeouts_as_the_published_set) {
     double timeouts = 0;
-    for (const float timeout : umaze_set().timeouts) timeouts += static_cast<double>(timeout);
+    for (const uint8_t timeout : umaze_set().timeouts) timeouts += timeout;
     constexpr double share = static_cast<double>(large_set) / 1e6;
     CHECK_CLOSE(timeouts, 12459 * share, 3.5 * 84 * std::sqrt(share + share * share));
 }
 
-// Where the controller pushes with 1, noise of deviation 0.5 leaves the action at 1 half of the time, and takes it below
-// 0 beyond two deviations.
+// Where the controller pushes with 1, noise of deviation 0.5 leaves the action at 1 half of the time, and takes it
+// below 0 beyond two deviations.
 TEST(actions_are_the_controllers_plus_noise_clipped) {
     WaypointController controller = umaze_controller();
     double pushes = 0, full = 0, reversed = 0, both = 0, both_full = 0;
@@ -351,7 +352,7 @@ TEST(actions_are_the_controllers_plus_noise_clipped) {
     CHECK_CLOSE(both_full / both, 0.25, 5 * std::sqrt(0.1875 / both));
 
     // Without noise: the controller's own. (Single precision may change a decision that hangs on the last digit.)
-    const MazeDataSet plain = collect_maze_data_set(task_of("maze2d-umaze"), 3000, test_seed(), {}, 0);
+    const CollectedRows<float> plain = collect_maze_data_set(task_of("maze2d-umaze"), 3000, test_seed(), {}, 0);
     WaypointController again = umaze_controller();
     int different = 0;
     for (size_t t = 0; t < plain.length(); ++t) {
@@ -368,14 +369,15 @@ TEST(actions_are_the_controllers_plus_noise_clipped) {
 TEST(a_maze_data_set_is_a_function_of_task_steps_and_seed) {
     std::vector<size_t> told;
     const auto tell = [&](size_t steps) { told.push_back(steps); };
-    const MazeDataSet again = collect_maze_data_set(task_of("maze2d-umaze"), 20500, test_seed(), tell);
+    const CollectedRows<float> again = collect_maze_data_set(task_of("maze2d-umaze"), 20500, test_seed(), tell);
     CHECK(told == (std::vector<size_t>{10000, 20000}));
-    MazeDataSet first = umaze_set();  // fewer steps are the beginning of more
-    for (auto* one : {&first.rewards, &first.terminals, &first.timeouts}) one->resize(20500);
+    CollectedRows<float> first = umaze_set();  // fewer steps are the beginning of more
+    first.rewards.resize(20500);
+    for (auto* flags : {&first.terminals, &first.timeouts}) flags->resize(20500);
     for (auto* two : {&first.actions, &first.goal, &first.qpos, &first.qvel}) two->resize(2 * 20500);
     first.observations.resize(4 * 20500);
     CHECK(equal(again, first));
-    const MazeDataSet other = collect_maze_data_set(task_of("maze2d-umaze"), 100, test_seed() + 1);
+    const CollectedRows<float> other = collect_maze_data_set(task_of("maze2d-umaze"), 100, test_seed() + 1);
     CHECK(!std::equal(other.goal.begin(), other.goal.end(), again.goal.begin()));
     CHECK(!std::equal(other.observations.begin(), other.observations.end(), again.observations.begin()));
     CHECK_EQUAL(collect_maze_data_set(task_of("maze2d-umaze"), 0, test_seed()).length(), size_t{0});
@@ -396,7 +398,7 @@ TEST(recorded_maze_actions_lead_through_the_recorded_observations) {
 // the way back, three times as many rewarded steps. So those that leave are the best, and there are more than the 1500
 // of the paper's buffer among the 12459 of the published set.
 TEST(the_best_umaze_trajectories_all_leave_the_goal) {
-    const MazeDataSet& set = umaze_set();
+    const CollectedRows<float>& set = umaze_set();
     size_t leaving = 0, arriving = 0, trajectories = 0;
     double total = 0;
     for (size_t row = 0, first = 0; row < set.length(); ++row) {
@@ -418,6 +420,35 @@ TEST(the_best_umaze_trajectories_all_leave_the_goal) {
 }
 
 // ----- scores -----
+
+namespace {
+
+enum class Planning {
+    every_episode,
+    once,  // as for D4RL's reference scores: the target stays, so all episodes follow the plan of the first one
+};
+
+// The undiscounted return of each episode when the controller is sent to the task's own goal. Episodes start as those
+// of a data set do. They are no episodes of play(): the controller needs the observation in double precision.
+std::vector<double> controller_returns(const MujocoTask& task, Planning planning, int episodes, uint32_t seed) {
+    WaypointController controller(maze2d_grid(task), Random{seed, Stream::data_set});
+    MujocoEnvironment environment(task, Physics::d4rl);
+    std::array<float, 4> state;
+    std::vector<double> returns;
+    for (int episode = 0; episode < episodes; ++episode) {
+        environment.reset(Random{seed, Stream::environment}, data_set_episodes + episode, state.data());
+        if (planning == Planning::every_episode) controller.target.reset();  // the next call plans anew
+        returns.push_back(0);
+        for (int t = 0; t < task.max_episode_steps; ++t) {
+            const std::vector<double>& o = environment.observation;
+            const MazePoint force = controller.act({o[0], o[1]}, {o[2], o[3]}, environment.goal).force;
+            returns.back() += environment.advance(force).reward;
+        }
+    }
+    return returns;
+}
+
+}  // namespace
 
 // Against the means of others, each good to about the standard error given: the controller measured apart from this
 // program over 300 episodes, and for one plan also D4RL's reference scores, means of 100.

@@ -11,6 +11,8 @@
 
 namespace {
 
+namespace fs = std::filesystem;
+
 // A fresh folder that goes away with the test.
 struct Scratch {
     std::string path;
@@ -45,12 +47,9 @@ void quiet_train(const Settings& settings, const std::string& folder, int thread
     const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
     std::fflush(stdout);
     dup2(null, 1), dup2(null, 2);
-    const Kernel* kernel = *std::find_if(std::begin(kernels), std::end(kernels), [&](const Kernel* one) {
-        return one->supported() && settings.arithmetic == one->arithmetic;
-    });
     std::exception_ptr problem;
     try {
-        train(settings, folder, {*kernel, threads, checkpoint_every});
+        train(settings, folder, {kernel_for(settings.arithmetic), threads, checkpoint_every});
     } catch (...) {
         problem = std::current_exception();
     }
@@ -76,10 +75,32 @@ struct Fixture {
     Run run;
     explicit Fixture(const Settings& settings)
         : compute(best_kernel(), 1),
-          run(compute, settings, make_grid_world(settings).spec()) {
-        begin_run(run, make_data_set(settings, make_grid_world(settings)));
+          run(compute, settings, make_grid_world(settings)) {
+        begin_run(run, make_data_set(settings));
+    }
+    void save(const std::string& path) { save_model(contents_of(run.agent), path); }
+    void save_checkpoint(const std::string& path) {
+        RunFolder folder{path};
+        folder.begin_logs();
+        ::save_checkpoint(folder, run.agent.settings, [&](auto& archive) { visit_state(archive, run); });
+    }
+    void load(const std::string& path) {
+        ModelContents contents = contents_of(run.agent);
+        load_model(contents, open_model(path));
     }
 };
+
+// The episodes of `count` copies of an environment, as rollout() plays them.
+std::vector<Episode> roll_out(Run& run, const Environment& environment, Act act, double target, uint64_t first,
+                              size_t count) {
+    std::vector<std::unique_ptr<Environment>> copies;
+    std::vector<Environment*> environments;
+    for (size_t i = 0; i < count; ++i) {
+        copies.push_back(environment.clone());
+        environments.push_back(copies.back().get());
+    }
+    return rollout(run.agent, run.acting, environments, act, target, first);
+}
 
 // A batch for the Gaussian and the categorical head alike: two windows of 1 and 3 steps.
 Batch painted_batch(int state_dim, int action_dim, int moves) {
@@ -89,14 +110,14 @@ Batch painted_batch(int state_dim, int action_dim, int moves) {
     for (int i = 0; i < 4; ++i) {
         batch.sequences.returns_to_go.push_back(paint(i + 11));
         batch.sequences.timesteps.push_back(i);
-        batch.mean.push_back(i == 0 ? 0.5f : 0.5f / 3);
+        batch.coefficients.push_back(i == 0 ? 0.5f : 0.5f / 3);
         batch.weights.push_back(i % 2 == 0 ? 1.0f : 0.75f);
     }
     for (int i = 0; i < 4 * state_dim; ++i) batch.sequences.states.push_back(paint(i));
     for (int i = 0; i < 4 * (moves > 0 ? moves : action_dim); ++i) batch.sequences.actions.push_back(paint(i + 50));
     for (int i = 0; i < 4 * action_dim; ++i) {
         batch.actions.push_back(moves > 0 ? static_cast<float>(i % moves) : paint(i + 90));
-        batch.remembered.push_back(moves > 0 ? static_cast<float>((3 * i + 1) % moves) : paint(i + 130));
+        batch.advised_actions.push_back(moves > 0 ? static_cast<float>((3 * i + 1) % moves) : paint(i + 130));
     }
     return batch;
 }
@@ -105,6 +126,27 @@ TransformerConfig tiny_config(Head head, int state_dim, int action_dim) {
     return {state_dim, action_dim, 2, 2, 8, 6, 0.1f, head};
 }
 
+}  // namespace
+
+// The program itself.
+namespace {
+struct Outcome {
+    int status;
+    std::string text;
+};
+Outcome shell(const std::string& command) {
+    FILE* pipe = popen((command + " 2>&1").c_str(), "r");
+    Outcome outcome = {0, ""};
+    for (int c; (c = std::fgetc(pipe)) != EOF;) outcome.text += static_cast<char>(c);
+    outcome.status = WEXITSTATUS(pclose(pipe));
+    return outcome;
+}
+void check_shell(const std::string& command, int status, const std::string& part) {
+    const Outcome outcome = shell(command);
+    if (outcome.status != status || outcome.text.find(part) == std::string::npos)
+        report_failure(__FILE__, __LINE__,
+                       command + ": status " + std::to_string(outcome.status) + ", said: " + outcome.text);
+}
 }  // namespace
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -279,7 +321,7 @@ TEST(objective_is_the_equations_written_out) {
             const size_t at = static_cast<size_t>(c);
             const double* log_p = policy.output.value + c * 5;
             const double w = batch.weights[at], a = log_p[static_cast<int>(batch.actions[at])],
-                         a_hat = log_p[static_cast<int>(batch.remembered[at])];
+                         a_hat = log_p[static_cast<int>(batch.advised_actions[at])];
             l -= w * a + (1 - w) * a_hat;
             j -= a;
             for (int move = 0; move < 5; ++move) h -= std::exp(log_p[move]) * log_p[move];
@@ -355,9 +397,10 @@ TEST(lambda_falls_when_the_entropy_is_above_eta_and_rises_below) {
     set_setting(settings, "eta", "1.5");
     for (const double entropy : {1.9, 1.1}) {
         Fixture f(settings);
-        const double before = f.run.temperature.log_lambda[0].value[0];
-        update_lambda(f.compute, f.run.temperature, f.run.agent.settings, entropy);
-        CHECK_CLOSE(f.run.temperature.log_lambda[0].value[0] - before, entropy > 1.5 ? -1e-4 : 1e-4, 1e-6);
+        Temperature& temperature = f.run.agent.temperature;
+        const double before = temperature.log_lambda[0].value[0];
+        update_lambda(f.compute, temperature, f.run.agent.settings, entropy);
+        CHECK_CLOSE(temperature.log_lambda[0].value[0] - before, entropy > 1.5 ? -1e-4 : 1e-4, 1e-6);
     }
 }
 
@@ -373,7 +416,7 @@ TEST(batches_hold_what_the_buffer_holds) {
     double sum = 0;
     size_t step = 0;
     for (uint32_t window = 0; window < 32; ++window) {
-        const Window at = f.run.replay.sample(f.run.random(Stream::batch), 0, window, 4);
+        const Window at = f.run.replay.sample(f.run.agent.random(Stream::batch), 0, window, 4);
         const Trajectory& trajectory = f.run.replay.trajectories[at.trajectory];
         CHECK_EQUAL(batch.sequences.lengths[window], std::min(4, trajectory.length() - at.start));
         for (int c = 0; c < at.length; ++c, ++step) {
@@ -384,7 +427,7 @@ TEST(batches_hold_what_the_buffer_holds) {
                         static_cast<float>(trajectory.terminated ? 1 : 0));  // reward 1 comes last
             const double d = trajectory.terminated ? std::pow(0.99, trajectory.length() - 1 - static_cast<int>(t)) : 0;
             CHECK_CLOSE(batch.discounted_returns[step], d, 1e-12);
-            sum += static_cast<double>(batch.mean[step]);
+            sum += static_cast<double>(batch.coefficients[step]);
         }
     }
     CHECK_CLOSE(sum, 1, 1e-6);
@@ -393,7 +436,7 @@ TEST(batches_hold_what_the_buffer_holds) {
 TEST(normalised_states_have_mean_zero_and_deviation_one) {
     Fixture f(tiny_settings("odt"));
     double count = 0, sum[2] = {}, squares[2] = {};
-    for (const Trajectory& trajectory : make_data_set(f.run.agent.settings, GridWorld{})) {
+    for (const Trajectory& trajectory : make_data_set(f.run.agent.settings)) {
         std::vector<float> x;
         for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t)
             append_normalised(x, f.run.agent.normaliser, &trajectory.states[2 * t]);
@@ -412,7 +455,7 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
     set_setting(settings, "batch_size", "512");
     Fixture f(settings);
     std::map<std::pair<float, float>, std::pair<double, float>> best;  // cell -> (d, a), first to reach it
-    for (const Trajectory& trajectory : offline_set(make_data_set(f.run.agent.settings, GridWorld{}), false))
+    for (const Trajectory& trajectory : offline_set(make_data_set(f.run.agent.settings), false))
         for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t) {
             const std::pair<float, float> cell = {trajectory.states[2 * t], trajectory.states[2 * t + 1]};
             const auto found = best.find(cell);
@@ -422,39 +465,49 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
     CHECK_EQUAL(f.run.memory.size(), best.size());
     Batch batch = sample_batch(f.run, 0, static_cast<uint32_t>(f.run.agent.settings.batch_size));
     consult_memory(f.run, batch);
-    count_consultation(f.run, batch);
     double short_pairs = 0;
     for (size_t i = 0; i < batch.weights.size(); ++i) {
         const auto [d, a] = best.at({batch.raw_states[i][0], batch.raw_states[i][1]});
         const bool falls_short = batch.discounted_returns[i] < d;
         CHECK_EQUAL(batch.weights[i], falls_short ? 0.75f : 1.0f);
-        if (falls_short) CHECK_EQUAL(batch.remembered[i], a);
+        if (falls_short) CHECK_EQUAL(batch.advised_actions[i], a);
         short_pairs += falls_short;
     }
-    CHECK_EQUAL(f.run.progress.short_pairs, short_pairs);
+    CHECK_EQUAL(f.run.tally.short_pairs, short_pairs);
     CHECK(short_pairs > 0 && short_pairs < 512);
 }
 
 // Dropout off: each part has masks of its own. Sums in another order, hence not the same bits.
-TEST(a_batch_in_parts_is_the_batch_as_a_whole) {
+TEST(an_update_in_parts_is_the_update_of_the_whole_batch) {
     Settings settings = tiny_settings("wodtem");
-    for (auto [name, value] : {std::pair{"dropout", "0"}, {"context_length", "3"}, {"batch_size", "30"}})
+    for (auto [name, value] : {std::pair{"dropout", "0"}, {"context_length", "3"}, {"batch_size", "500"}})
         set_setting(settings, name, value);
     Fixture whole(settings), parts(settings);
-    whole.run.parts = 1;
-    parts.run.parts = 7;
+    CHECK_EQUAL(parts_of_batch(settings), 3u);
+    Agent& agent = whole.run.agent;
+    Tape<float>& tape = whole.run.learning;
     for (int i = 0; i < 3; ++i) {
-        update(whole.run);
+        tape.reset();
+        Batch batch = sample_batch(whole.run, 0, 500);
+        consult_memory(whole.run, batch);
+        const Policy<float> policy = forward(tape, agent.model, batch.sequences, Queries::every_state);
+        const Objective<float> result = objective(tape, policy, batch, nullptr, agent.temperature.lambda(), true);
+        tape.backward(result.lagrangian);
+        const double norm =
+            update_parameters(whole.compute, agent.model.parameters, whole.run.optimizer, optimizer_config(settings));
+        update_lambda(whole.compute, agent.temperature, settings, result.H.value[0]);
+        whole.run.progress.updates += 1;
+
+        parts.run.tally = {};
         update(parts.run);
-        CHECK_CLOSE(parts.run.progress.loss, whole.run.progress.loss, 1e-5);
-        CHECK_CLOSE(parts.run.progress.entropy, whole.run.progress.entropy, 1e-5);
-        CHECK_EQUAL(parts.run.progress.pairs, whole.run.progress.pairs);
-        CHECK_CLOSE(parts.run.progress.gradient_norm, whole.run.progress.gradient_norm, 1e-4);
+        CHECK_CLOSE(parts.run.tally.loss, result.L.value[0], 1e-5);
+        CHECK_CLOSE(parts.run.tally.entropy, result.H.value[0], 1e-5);
+        CHECK_CLOSE(parts.run.tally.gradient_norm, norm, 1e-4);
+        CHECK_EQUAL(parts.run.tally.pairs, static_cast<double>(batch.weights.size()));
     }
-    for (size_t p = 0; p < whole.run.agent.model.parameters.size(); ++p)
-        for (size_t i = 0; i < whole.run.agent.model.parameters[p].value.size(); ++i)
-            CHECK_CLOSE(parts.run.agent.model.parameters[p].value[i], whole.run.agent.model.parameters[p].value[i],
-                        1e-4);
+    for (size_t p = 0; p < agent.model.parameters.size(); ++p)
+        for (size_t i = 0; i < agent.model.parameters[p].value.size(); ++i)
+            CHECK_CLOSE(parts.run.agent.model.parameters[p].value[i], agent.model.parameters[p].value[i], 1e-4);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -465,10 +518,9 @@ TEST(episodes_side_by_side_are_the_episodes_one_by_one) {
     set_setting(settings, "context_length", "3");
     set_setting(settings, "eval_context", "3");
     Fixture f(settings);
-    std::vector<GridWorld> worlds(4);
-    const std::vector<Episode> together = rollout(f.run, worlds, Act::sample, 2, 5, 4);
+    const std::vector<Episode> together = roll_out(f.run, GridWorld{}, Act::sample, 2, 5, 4);
     for (uint64_t i = 0; i < 4; ++i) {
-        const Trajectory alone = rollout(f.run, worlds, Act::sample, 2, 5 + i, 1)[0].trajectory;
+        const Trajectory alone = roll_out(f.run, GridWorld{}, Act::sample, 2, 5 + i, 1)[0].trajectory;
         CHECK(alone.actions == together[i].trajectory.actions && alone.states == together[i].trajectory.states);
     }
     CHECK(together[0].trajectory.actions != together[1].trajectory.actions);
@@ -492,25 +544,36 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
 
 TEST(a_move_of_probability_zero_is_never_drawn) {
     const float log_p[] = {-INFINITY, 0, -INFINITY};
-    for (const double uniform : {0.0, 0.5, 1 - 0x1p-53}) CHECK_EQUAL(sampled_move(log_p, 3, uniform), 1);
+    for (const double uniform : {0.0, 0.5, 1 - 0x1p-53}) CHECK_EQUAL(sampled_action(log_p, 3, uniform), 1);
 }
+
+namespace {
+// Adds the action to its state of one number, pays 2.5, and ends beyond 2.
+struct Paying : Environment {
+    float state = 0;
+    EnvironmentSpec spec() const override { return {1, 1, 0, 9}; }
+    void reset(const Random&, uint64_t, float* first) override { *first = state = 0; }
+    Step step(const float* action, float* next) override {
+        *next = state += *action;
+        return {2.5, state > 2};
+    }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Paying>(*this); }
+};
+}  // namespace
 
 // WODTEM sec. III-B, g_{t+1} test: with rewards on the way, of which the grid world has none.
 TEST(the_return_to_go_falls_by_each_reward) {
-    struct Paying {
-        Step step(const float* action, float* state) {
-            state[0] += *action;
-            return {2.5, state[0] > 2};
-        }
-    } environment;
-    Episode episode;
-    episode.state = {0};
-    episode.returns_to_go = {5};
-    for (int t = 0; t < 3; ++t) step_episode(episode, environment, {1}, 0.5);
-    CHECK(episode.returns_to_go == std::vector<float>({5, 3.75f, 2.5f, 1.25f}));
+    Paying environment;
+    std::vector<float> given;
+    const Episode episode = play(environment, Random{0, Stream::environment}, 7, [&](Episode& running) {
+        append_target(running, 10, 0.5);
+        given = running.targets;
+        return std::vector<float>{1};
+    });
+    CHECK(given == std::vector<float>({5, 3.75f, 2.5f}));
     CHECK(episode.trajectory.states == std::vector<float>({0, 1, 2}));  // before each step
     CHECK(episode.trajectory.rewards == std::vector<float>({2.5f, 2.5f, 2.5f}));
-    CHECK(episode.over && episode.trajectory.terminated && episode.state[0] == 3);
+    CHECK(episode.over && episode.trajectory.terminated && episode.state[0] == 3 && episode.number == 7);
 }
 
 // WODTEM sec. III-B, g_{t+1} test: the agent is told the target less what it received; the buffer gets hindsight
@@ -522,13 +585,14 @@ TEST(acting_is_told_the_target_less_the_rewards_so_far) {
     Fixture f(settings);
     std::vector<Episode> episodes(2);
     episodes[0].state = {1, 2};
-    episodes[0].returns_to_go = {2};
+    episodes[0].targets = {2};
     episodes[1].state = {4, 5};
-    episodes[1].returns_to_go = {2, 2, 1.5f};
+    episodes[1].targets = {2, 2, 1.5f};
     episodes[1].trajectory.states = {0, 0, 3, 3};
     episodes[1].trajectory.actions = {4, 1};
     episodes[1].trajectory.rewards = {0, 0.5f};
-    const SequenceBatch batch = acting_batch(f.run.agent, episodes);
+    Episode* const running[] = {&episodes[0], &episodes[1]};
+    const SequenceBatch batch = acting_batch(f.run.agent, running);
     CHECK(batch.lengths == (std::vector<int>{1, 2}));
     CHECK(batch.returns_to_go == (std::vector<float>{2, 2, 1.5f}));
     CHECK(batch.timesteps == (std::vector<int>{0, 1, 2}));
@@ -537,8 +601,7 @@ TEST(acting_is_told_the_target_less_the_rewards_so_far) {
         append_normalised(expected, f.run.agent.normaliser, state.data());
     CHECK(batch.states == expected);
     CHECK_EQUAL(batch.actions[8 + 1], 1.0f);  // the second window's first step made move 1
-    std::vector<GridWorld> world(1);
-    const Trajectory played = rollout(f.run, world, Act::sample, 2, 0, 1)[0].trajectory;
+    const Trajectory played = roll_out(f.run, GridWorld{}, Act::sample, 2, 0, 1)[0].trajectory;
     CHECK_EQUAL(played.returns_to_go[0], played.terminated ? 1.0 : 0.0);
 }
 
@@ -567,6 +630,32 @@ TEST(wodtem_with_alpha_one_is_odt_bit_for_bit) {
     const TensorFile odt = read_safetensors(scratch / "odt/model.safetensors"),
                      one = read_safetensors(scratch / "one/model.safetensors");
     CHECK(odt.buffer.substr(odt.data_start) == one.buffer.substr(one.data_start));
+}
+
+// The same promise, and that of being resumed, for each kind of arithmetic that this machine has.
+TEST(promises_hold_in_every_arithmetic) {
+    for (const Kernel* kernel : kernels) {
+        if (!kernel->supported()) continue;
+        const Scratch scratch;
+        const auto settings = [&](const char* method, const char* alpha) {
+            Settings all = tiny_settings(method, alpha);
+            for (auto [name, value] : std::initializer_list<std::pair<const char*, const char*>>{
+                     {"offline_updates", "5"}, {"online_steps", "150"}, {"updates_per_iteration", "1"}})
+                set_setting(all, name, value);
+            all.arithmetic = kernel->arithmetic;
+            return all;
+        };
+        quiet_train(settings("odt", "1"), scratch / "odt");
+        quiet_train(settings("wodtem", "1"), scratch / "one", 3);
+        CHECK(read_file(scratch / "odt/policy.csv") == read_file(scratch / "one/policy.csv"));
+        stop_requested = 1;
+        CHECK_FAILS("run.stopped", quiet_train(settings("wodtem", "1"), scratch / "stopped"));
+        stop_requested = 0;
+        quiet_train(settings("wodtem", "1"), scratch / "stopped");
+        check_same_results(scratch / "one", scratch / "stopped");
+        quiet_train(settings("wodtem", "0.75"), scratch / "wodtem");
+        CHECK(read_file(scratch / "wodtem/policy.csv") != read_file(scratch / "one/policy.csv"));
+    }
 }
 
 // Kills a run again and again, at any moment, with a checkpoint after each update; it must end as if nothing had been.
@@ -613,9 +702,10 @@ TEST(evaluation_needs_the_model_file_alone) {
     fs::remove_all(scratch / "run");
     const TensorFile file = open_model(scratch / "model.safetensors");
     Fixture f(settings_from_text(file.text("settings"), file.path));
-    load_model(f.run, file);
-    std::vector<GridWorld> worlds(2);
-    const Evaluation evaluation = evaluate(f.run, worlds, 0, 2);
+    f.load(scratch / "model.safetensors");
+    GridWorld worlds[2];
+    Environment* const environments[] = {&worlds[0], &worlds[1]};
+    const Evaluation evaluation = evaluate(f.run.agent, f.run.acting, environments, 0);
     CHECK_EQUAL(number_text(evaluation.mean_length), progress.rows.back()[12]);
     CHECK_EQUAL(number_text(evaluation.mean_return), progress.rows.back()[13]);
 }
@@ -735,23 +825,90 @@ TEST(a_damaged_checkpoint_or_log_is_refused_with_the_files_kept) {
     CHECK_FAILS("settings.missing", quiet_train(tiny_settings("wodtem"), scratch / "run"));
 }
 
-TEST(mean_lengths_are_exact) {
-    Settings settings = tiny_settings("odt");
+// The checkpoint's tensors are written again, one of them with other numbers.
+TEST(a_checkpoint_whose_normaliser_has_another_length_or_value_is_refused) {
+    const Scratch scratch;
+    stop_requested = 1;
+    CHECK_FAILS("run.stopped", quiet_train(tiny_settings("odt"), scratch / "run"));
+    stop_requested = 0;
+    const std::string path = scratch / "run/checkpoint.safetensors";
+    const TensorFile file = read_safetensors(path);
+    const auto with = [&](const std::string& name, const std::vector<float>& values) {
+        TensorFile other;
+        other.metadata = file.metadata;
+        for (const StoredTensor& tensor : file.tensors) {
+            if (tensor.name == name)
+                other.add(name, {values.size()}, values);
+            else if (tensor.dtype == DType::F32)
+                other.add(tensor.name, tensor.shape, file.get<float>(tensor.name, tensor.shape));
+            else if (tensor.dtype == DType::F64)
+                other.add(tensor.name, tensor.shape, file.get<double>(tensor.name, tensor.shape));
+            else if (tensor.dtype == DType::U64)
+                other.add(tensor.name, tensor.shape, file.get<uint64_t>(tensor.name, tensor.shape));
+            else
+                other.add(tensor.name, tensor.shape, file.get<uint32_t>(tensor.name, tensor.shape));
+        }
+        write_safetensors(path, other);
+    };
+    for (const char* name : {"normaliser.mean", "normaliser.deviation"}) {
+        for (const std::vector<float>& values : {std::vector<float>{1}, {1, 2, 3}}) {
+            with(name, values);
+            CHECK_FAILS("safetensors.shape", quiet_train(tiny_settings("odt"), scratch / "run"));
+        }
+    }
+    with("normaliser.deviation", {1, 0});
+    CHECK_FAILS("model.value", quiet_train(tiny_settings("odt"), scratch / "run"));
+    with("normaliser.deviation", file.get<float>("normaliser.deviation", {2}));
+    quiet_train(tiny_settings("odt"), scratch / "run");
+}
+
+// A table of 1e8 entries would take more than a gigabyte; a model's network alone is allocated.
+TEST(a_models_table_size_costs_evaluation_nothing) {
+    const Scratch scratch;
+    Settings settings = tiny_settings("wodtem");
     Fixture f(settings);
-    std::vector<GridWorld> worlds(11);
-    const double length = evaluate(f.run, worlds, 0, 1).mean_length;
-    CHECK_EQUAL(evaluate(f.run, worlds, 0, 11).mean_length, length);  // nothing is random: eleven times the same
+    f.run.agent.settings.table_size = 100000000;
+    f.save(scratch / "model.safetensors");
+    const std::string limit = "(ulimit -v 900000; ./wodtem ";
+    check_shell(limit + "eval " + (scratch / "model.safetensors") + " --threads 1)", 0, "mean length");
+    check_shell(limit + "export --odt " + (scratch / "model.safetensors") + " " + (scratch / "odt.safetensors") + ")",
+                0, "strict load_state_dict");
+    check_shell(limit + "import " + (scratch / "odt.safetensors") + " " + (scratch / "back.safetensors") + ")", 0,
+                "gridworld");
+}
+
+TEST(saving_checkpoints_takes_at_most_a_twentieth_of_the_time) {
+    CheckpointTimer timer{10};
+    CHECK(!timer.due());
+    timer.saved -= std::chrono::seconds(11);
+    CHECK(timer.due());
+    timer.save_seconds = 2;
+    CHECK(!timer.due());  // 40 seconds are to pass
+    timer.saved -= std::chrono::seconds(30);
+    CHECK(timer.due());
+    CHECK(CheckpointTimer{0}.due());
+}
+
+TEST(mean_lengths_are_exact) {
+    Fixture f(tiny_settings("odt"));
+    const auto mean_length = [&](size_t count) {
+        std::vector<GridWorld> worlds(count);
+        std::vector<Environment*> environments;
+        for (GridWorld& world : worlds) environments.push_back(&world);
+        return evaluate(f.run.agent, f.run.acting, environments, 0).mean_length;
+    };
+    CHECK_EQUAL(mean_length(11), mean_length(1));  // nothing is random: eleven times the same
 }
 
 TEST(damaged_models_are_refused) {
     const Scratch scratch;
     Fixture f(tiny_settings("odt"));
-    save_model(f.run, scratch / "model.safetensors");
-    load_model(f.run, open_model(scratch / "model.safetensors"));
+    f.save(scratch / "model.safetensors");
+    f.load(scratch / "model.safetensors");
     f.run.agent.model.parameters[3].value[0] = NAN;
-    save_model(f.run, scratch / "nan.safetensors");
-    CHECK_FAILS("model.value", load_model(f.run, open_model(scratch / "nan.safetensors")));
-    save_checkpoint(f.run, {scratch.path});
+    f.save(scratch / "nan.safetensors");
+    CHECK_FAILS("model.value", f.load(scratch / "nan.safetensors"));
+    f.save_checkpoint(scratch.path);
     CHECK_FAILS("model.format", open_model(scratch / "checkpoint.safetensors"));
     CHECK_FAILS("file.open", open_model(scratch / "none.safetensors"));
 }
@@ -785,101 +942,93 @@ TEST(an_impossible_folder_or_a_full_disk_is_a_sentence) {
 }
 
 TEST(numbers_that_are_not_finite_stop_the_run_and_name_the_tensor) {
-    const Scratch scratch;
     Fixture f(tiny_settings("odt"));
-    Session<GridWorld> session{{GridWorld{}}, {scratch.path}, {}, 1e9};
     f.run.agent.model.parameters.back().value[2] = INFINITY;  // a logit's bias
-    CHECK_FAILS("nn.not_finite", update_and_watch(f.run, session));
+    CHECK_FAILS("nn.not_finite", update(f.run));
     Fixture g(tiny_settings("odt"));
     g.run.agent.model.parameters[0].gradient[1] = NAN;
     try {
-        update_and_watch(g.run, session);
+        update(g.run);
         CHECK(false);
     } catch (const Error& error) {
+        CHECK(std::string(error.what()).find("embed_return.weight") != std::string::npos);
+    }
+    // Training says at which update, and keeps what it has.
+    const Scratch scratch;
+    Settings settings = tiny_settings("odt");
+    settings.learning_rate = 1e30;  // beyond what the command line allows
+    settings.clip_norm = 0;
+    settings.warmup_updates = 0;
+    try {
+        quiet_train(settings, scratch / "run");
+        CHECK(false);
+    } catch (const Error& error) {
+        CHECK_EQUAL(error.id, "nn.not_finite");
         const std::string sentence = error.what();
-        CHECK(sentence.find("embed_return.weight") != std::string::npos &&
-              sentence.find("update 1 ") != std::string::npos);
+        CHECK(sentence.find("update ") == 0 && sentence.find(scratch / "run") != std::string::npos);
     }
 }
-
-// The program itself.
-namespace {
-struct Outcome {
-    int status;
-    std::string text;
-};
-Outcome shell(const std::string& command) {
-    FILE* pipe = popen((command + " 2>&1").c_str(), "r");
-    Outcome outcome = {0, ""};
-    for (int c; (c = std::fgetc(pipe)) != EOF;) outcome.text += static_cast<char>(c);
-    outcome.status = WEXITSTATUS(pclose(pipe));
-    return outcome;
-}
-void check_shell(const std::string& command, int status, const std::string& part) {
-    const Outcome outcome = shell(command);
-    if (outcome.status != status || outcome.text.find(part) == std::string::npos)
-        report_failure(__FILE__, __LINE__,
-                       command + ": status " + std::to_string(outcome.status) + ", said: " + outcome.text);
-}
-}  // namespace
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Episodes that the physics engine spoils, and runs on the MuJoCo tasks
 
 namespace {
-// Stands where the engine's errors come from: odd episodes fail at their third step, even ones go on for five.
-struct Faulty {
+// Odd episodes fail at their third step, even ones go on for five and pay 1 a step.
+struct Faulty : Environment {
     uint64_t episode = 0;
     int steps = 0;
-    EnvironmentSpec spec() const { return GridWorld{}.spec(); }
-    void reset(const Random&, uint64_t number, float* state) {
-        episode = number, steps = 0;
+    EnvironmentSpec spec() const override { return GridWorld{}.spec(); }
+    void reset(const Random&, uint64_t number, float* state) override {
+        episode = number;
+        steps = 0;
         state[0] = state[1] = 0;
     }
-    Step step(const float*, float* state) {
-        if (++steps == 3 && episode % 2 == 1) fail("mujoco.unstable", "faulty: step 3: as agreed");
+    Step step(const float*, float* state) override {
+        if (++steps == 3 && episode % 2 == 1) fail("environment.unstable", "faulty: step 3: as agreed");
         state[0] = static_cast<float>(steps);
         return {1, steps == 5};
     }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Faulty>(*this); }
 };
-[[maybe_unused]] void save_paths(const std::vector<Faulty>&, const Evaluation&, const RunFolder&) {}
-[[maybe_unused]] double score_of(const Faulty&, double total_return) { return total_return; }
-
-// f without what it says to stderr.
-template <class F>
-void quietly(F&& f) {
-    const int err = dup(2), null = open("/dev/null", O_WRONLY);
-    dup2(null, 2);
-    f();
-    dup2(err, 2);
-    close(err), close(null);
-}
 }  // namespace
 
-TEST(episodes_that_the_engine_spoils_are_counted_and_used_for_nothing) {
-    const Scratch scratch;
-    Fixture f(tiny_settings("wodtem"));
-    Session<Faulty> session{std::vector<Faulty>(4), {scratch.path}, {}, 1e9};
-    quietly([&] {
-        const Evaluation four = evaluate(f.run, session.environments, 0, 4);  // episodes 0 to 3 after 2^40
-        CHECK_EQUAL(four.mean_length, 5.0);
-        CHECK_EQUAL(four.mean_return, 5.0);
-        CHECK_EQUAL(f.run.progress.dropped, 2.0);
-        const size_t buffered = f.run.replay.trajectories.size(), remembered = f.run.memory.size();
-        f.run.progress.episodes = 7;
-        interact(f.run, session);
-        CHECK_EQUAL(f.run.progress.dropped, 3.0);
-        CHECK_EQUAL(f.run.progress.episodes, uint64_t{8});
-        CHECK_EQUAL(f.run.progress.interactions, uint64_t{3});  // they happened
-        CHECK_EQUAL(f.run.replay.trajectories.size(), buffered);
-        CHECK_EQUAL(f.run.memory.size(), remembered);
-        CHECK(!fs::exists(scratch / "episodes.csv"));
-        interact(f.run, session);
-        CHECK_EQUAL(f.run.progress.interactions, uint64_t{8});
-        CHECK(fs::exists(scratch / "episodes.csv"));
-        const Evaluation none = evaluate(f.run, session.environments, evaluation_episodes + 1, 1);  // an odd number
-        CHECK(std::isnan(none.mean_length) && std::isnan(none.mean_return));
-    });
+TEST(episodes_whose_simulation_breaks_down_are_counted_and_used_for_nothing) {
+    Settings settings = tiny_settings("wodtem");
+    settings.eval_episodes = 4;
+    Fixture f(settings);
+    f.run.environments = Environments(Faulty{}, 4);
+    std::vector<std::string> dropped;
+    int played = 0;
+    double evaluated_length = NAN, evaluated_return = NAN, dropped_of_row = NAN;
+    Observer observer;
+    observer.dropped = [&](const std::string& sentence) { dropped.push_back(sentence); };
+    observer.played = [&](const EpisodeRow&) { ++played; };
+    observer.pause = [](double) {};
+    observer.evaluated = [&](const ProgressRow& row, const Evaluation&) {
+        evaluated_length = row.eval_length;
+        evaluated_return = row.eval_return;
+        dropped_of_row = row.tally.dropped;
+    };
+    evaluate_and_report(f.run, observer);  // episodes 0 to 3 after 2^40
+    CHECK_EQUAL(evaluated_length, 5.0);
+    CHECK_EQUAL(evaluated_return, 5.0);
+    CHECK_EQUAL(dropped_of_row, 2.0);
+    CHECK(dropped.size() == 2 && dropped[0].find("an evaluation episode is dropped: faulty: step 3") == 0);
+    const size_t buffered = f.run.replay.trajectories.size(), entries = f.run.memory.size();
+    f.run.progress.episodes = 7;
+    interact(f.run, observer);
+    CHECK_EQUAL(f.run.tally.dropped, 1.0);
+    CHECK_EQUAL(f.run.progress.episodes, uint64_t{8});
+    CHECK_EQUAL(f.run.progress.interactions, uint64_t{3});  // they happened
+    CHECK_EQUAL(f.run.replay.trajectories.size(), buffered);
+    CHECK_EQUAL(f.run.memory.size(), entries);
+    CHECK_EQUAL(played, 0);
+    interact(f.run, observer);
+    CHECK_EQUAL(f.run.progress.interactions, uint64_t{8});
+    CHECK_EQUAL(played, 1);
+    const Evaluation none =
+        evaluate(f.run.agent, f.run.acting, f.run.environments.first(), 1);  // episode 2^40 + 1, an odd number
+    CHECK(std::isnan(none.mean_length) && std::isnan(none.mean_return));
 }
 
 #ifdef WODTEM_MUJOCO
@@ -966,7 +1115,7 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     check_shell("./wodtem collect hopper", 2, "nearest is");
     check_shell("./wodtem collect hopper-medium --policy data/policies/halfcheetah-medium.safetensors --out " +
                     (scratch / "x.hdf5"),
-                1, "another task's");
+                1, "has 17 inputs and 6 actions, expected 11 and 3");
     check_shell("./wodtem collect hopper-medium --policy README.md --out " + (scratch / "x.hdf5"), 1, "README.md");
     CHECK(!fs::exists(scratch / "x.hdf5") && !fs::exists(scratch / "x.hdf5.tmp"));
     check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  85,000 updates of 5 ms");
@@ -983,13 +1132,11 @@ TEST(every_method_and_physics_trains_on_continuous_actions) {
     CHECK(read_file(scratch / "2.2/progress.csv").find("2.2 on MuJoCo") != std::string::npos);
     CHECK(read_file(scratch / "2.2/settings").find("physics = 2.2") != std::string::npos);
     const TensorFile file = open_model(scratch / "dt/model.safetensors");
-    Compute compute(best_kernel(), 1);
     const Settings saved = settings_from_text(file.text("settings"), file.path);
-    with_environment(saved, [&](const auto& environment) {
-        Run run(compute, saved, environment.spec());
-        load_model(run, file);
-        CHECK(run.agent.model.config.head == Head::deterministic);
-    });
+    Agent agent(saved, make_environment(saved)->spec());
+    ModelContents contents = contents_of(agent);
+    load_model(contents, file);
+    CHECK(agent.model.config.head == Head::deterministic);
 }
 
 #endif
@@ -1089,12 +1236,11 @@ TEST(a_model_made_by_rule_is_read_and_written_back_byte_for_byte) {
     const std::string golden = golden_file(golden_header(golden_tensors, true), golden_tensors);
     write_file_atomic(scratch / "golden.safetensors", golden);
     Fixture f(tiny_settings("odt"));
-    const TensorFile file = open_model(scratch / "golden.safetensors");
-    load_model(f.run, file);
-    load_counts(f.run, file);
-    CHECK_EQUAL(f.run.progress.interactions, 345u);
+    ModelContents contents = contents_of(f.run.agent);
+    load_model(contents, open_model(scratch / "golden.safetensors"));
+    CHECK_EQUAL(contents.interactions, 345u);
     CHECK_EQUAL(f.run.agent.model.parameters[0].value[1], 0.5f + 37.0f / 128.0f);
-    save_model(f.run, scratch / "back.safetensors");
+    save_model(contents, scratch / "back.safetensors");
     CHECK(read_file(scratch / "back.safetensors") == golden);
     check_shell("./wodtem eval " + scratch / "golden.safetensors", 0, "gridworld, odt, seed 0: mean length");
 }
@@ -1107,7 +1253,7 @@ TEST(bad_models_are_refused_with_file_tensor_and_offset) {
     const auto refuses = [&](const std::string& bytes, const char* id, const std::string& part) {
         write_file_atomic(path, bytes);
         try {
-            load_model(f.run, open_model(path));
+            f.load(path);
             report_failure(__FILE__, __LINE__, "nothing was refused: " + part);
         } catch (const Error& error) {
             CHECK_EQUAL(error.id, id);
@@ -1123,7 +1269,7 @@ TEST(bad_models_are_refused_with_file_tensor_and_offset) {
     };
     const std::string whole = golden_file(good, golden_tensors);
     write_file_atomic(path, whole);
-    load_model(f.run, open_model(path));  // without checksums too: made elsewhere
+    f.load(path);  // without checksums too: made elsewhere
     refuses("PK\3\4 is another magic", "safetensors.header_length", "offset 0");
     refuses(std::string("\xff\xff\xff\x7f\0\0\0\0", 8) + whole.substr(8), "safetensors.header_length", "offset 0");
     refuses(std::string("\0\0\1\0\0\0\0\0", 8) + whole.substr(8), "safetensors.truncated", "65536");
@@ -1161,7 +1307,7 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
     const Scratch scratch;
     Fixture f(tiny_settings("wodtem"));
     for (int i = 0; i < 3; ++i) update(f.run);
-    save_model(f.run, scratch / "model.safetensors");
+    f.save(scratch / "model.safetensors");
     const std::string odt = scratch / "odt.safetensors", back = scratch / "back.safetensors";
     check_shell("./wodtem export --odt " + scratch / "model.safetensors" + " " + odt, 0, "strict load_state_dict");
     const TensorFile file = read_safetensors(odt);
@@ -1197,12 +1343,12 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
     check_shell("./wodtem import " + scratch / "plain.safetensors" + " " + back, 2, "--task");
     check_shell("./wodtem import " + scratch / "plain.safetensors" + " " + back + set, 0, "gridworld, wodtem");
     Fixture other(tiny_settings("wodtem"));
-    load_model(other.run, open_model(back));
+    other.load(back);
     CHECK(other.run.agent.model.parameters[4].value == f.run.agent.model.parameters[4].value);
     CHECK(other.run.agent.normaliser.mean == f.run.agent.normaliser.mean);
-    CHECK_EQUAL(other.run.temperature.lambda(), Temperature(0.1).lambda());
+    CHECK_EQUAL(other.run.agent.temperature.lambda(), Temperature(0.1).lambda());
     check_shell("./wodtem import " + scratch / "full.safetensors" + " " + back + set, 0, "gridworld, wodtem");
-    load_model(other.run, open_model(back));
+    other.load(back);
     CHECK_EQUAL(other.run.agent.normaliser.deviation[1], 4.0f);
     check_shell("./wodtem import " + odt + " " + back + set + " --set layers=2", 1, "\"transformer.h.1.ln_1.weight\"");
     check_shell("./wodtem import " + odt + " " + back + set + " --set width=16", 1,
@@ -1232,13 +1378,13 @@ TEST(a_run_can_begin_with_a_models_weights) {
     Fixture f(tiny_settings("odt"));
     for (int i = 0; i < 3; ++i) update(f.run);
     f.run.agent.normaliser = {{1, 2}, {3, 4}};
-    save_model(f.run, scratch / "model.safetensors");
+    f.save(scratch / "model.safetensors");
     Settings settings = tiny_settings("wodtem");
     settings.weights_path = scratch / "model.safetensors";
     Fixture g(settings);
     for (size_t i = 0; i < f.run.agent.model.parameters.size(); ++i)
         CHECK(g.run.agent.model.parameters[i].value == f.run.agent.model.parameters[i].value);
-    CHECK_EQUAL(g.run.temperature.lambda(), f.run.temperature.lambda());
+    CHECK_EQUAL(g.run.agent.temperature.lambda(), f.run.agent.temperature.lambda());
     CHECK(g.run.agent.normaliser.mean == f.run.agent.normaliser.mean);
     CHECK_EQUAL(g.run.progress.updates, 0u);
     set_setting(settings, "heads", "2");
@@ -1267,8 +1413,8 @@ TEST(a_dump_is_the_update_that_the_run_makes) {
         const std::vector<float> after = file.get<float>("update_4/out/after_1/" + parameter.name, parameter.shape);
         for (size_t i = 0; i < after.size(); ++i) CHECK_CLOSE(after[i], parameter.value[i], 2e-4);  // Adam: of 0.004
     }
-    CHECK_CLOSE(file.get<float>("update_4/out/log_temperature", {1})[0], made.run.temperature.log_lambda[0].value[0],
-                1e-6);
+    CHECK_CLOSE(file.get<float>("update_4/out/log_temperature", {1})[0],
+                made.run.agent.temperature.log_lambda[0].value[0], 1e-6);
     check_shell("./wodtem check " + path, 0, "1 cases, 0 failed");
 
     // One number that is not what it should be is found, and named.
@@ -1298,7 +1444,7 @@ TEST(a_run_folder_is_dumped_at_its_first_update_or_its_next) {
     for (int i = 0; i < 2; ++i) update(f.run);
     fs::create_directory(scratch / "unfinished");
     write_file_atomic(scratch / "unfinished/settings", settings_text(f.run.agent.settings));
-    save_checkpoint(f.run, {scratch / "unfinished"});
+    f.save_checkpoint(scratch / "unfinished");
     check_shell("./wodtem check --dump " + path + " --run " + scratch / "unfinished", 0, "update 3, ");
     check_shell("./wodtem check " + path, 0, "1 cases, 0 failed");
     CHECK(fs::exists(scratch / "unfinished/checkpoint.safetensors"));
@@ -1335,7 +1481,9 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --set alhpa=1", 2, "nearest is \"alpha\"");
     check_shell("./wodtem train gridworld --set alpha", 2, "NAME=VALUE");
     check_shell("./wodtem train gridworld --set width=15 --set heads=2", 2, "nearest width is 16");
-    check_shell("./wodtem train gridworld --kernel sse9", 2, "it has: ");
+    check_shell("./wodtem train gridworld --kernel sse9", 2, "portable");
+    check_shell("./wodtem train gridworld --method odt --methods dt,odt", 2, "choose one");
+    check_shell("./wodtem train gridworld --methods dt,odd", 2, "nearest is \"odt\"");
     check_shell("./wodtem train gridworld --threads 1000", 2, "nearest is 256");
     check_shell("./wodtem train", 2, "TASK");
     check_shell("./wodtem sweep --seeds 4-0", 2, "range");
@@ -1360,6 +1508,21 @@ TEST(failures_exit_with_one_and_a_sentence) {
     check_shell("./wodtem sweep --seeds 0-1 --methods odt,wodtem", 0,
                 "train gridworld --method wodtem --preset small --seed 1");
 }
+
+#ifdef WODTEM_MUJOCO
+
+TEST(an_evaluation_names_the_library_that_ran_and_counts_its_sound_episodes) {
+    const Scratch scratch;
+    Settings settings = tiny_mujoco_settings("maze2d-umaze-v1", "odt");
+    settings.mujoco = "0.0.1";  // of the machine where the model was trained
+    Agent agent(settings, spec_of(settings));
+    agent.normaliser = {{0, 0, 0, 0}, {1, 1, 1, 1}};
+    save_model(contents_of(agent), scratch / "model.safetensors");
+    check_shell("./wodtem eval " + (scratch / "model.safetensors") + " --episodes 2", 0,
+                "over 2 episodes (d4rl on MuJoCo " + mujoco_version() + ")");
+}
+
+#endif
 
 #ifdef WODTEM_MUJOCO
 
@@ -1402,3 +1565,6 @@ TEST(trace_answers_line_by_line_and_refuses_what_it_cannot_read) {
 }
 
 #endif
+
+// For test_vectors.cpp, which does not include wodtem.cpp.
+int run_command_line(const std::vector<std::string>& words) { return run_command_line(commands, words); }

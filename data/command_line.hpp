@@ -1,0 +1,436 @@
+// command_line.hpp: `wodtem COMMAND WORDS... --option value...`: options, their parsing, help, and the settings that a
+// command line describes. The table of commands itself, which names the functions, stands in wodtem.cpp.
+//
+// Promises: results go to stdout, progress and errors to stderr; bad usage is a sentence that names the nearest right
+// word, and exit status 2; other failures exit with 1.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <csignal>
+#include <cstdint>
+#include <cstdio>
+#include <filesystem>
+#include <fstream>
+#include <map>
+#include <new>
+#include <set>
+#include <span>
+#include <string>
+#include <string_view>
+#include <thread>
+#include <vector>
+
+#include "../nn.hpp"
+#include "d4rl.hpp"
+#include "model_file.hpp"
+#include "settings.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Commands and options.
+
+struct Option {
+    const char* commands;  // that take it, separated by blanks
+    const char* name;
+    const char* value;     // placeholder of what follows it, or null for a switch
+    const char* fallback;  // its value where it is not given
+    const char* meaning;
+};
+
+inline const Option option_table[] = {
+    {"import tasks", "--method", "NAME", "wodtem", "dt, odt or wodtem"},
+    {"train", "--method", "NAME", "", "dt, odt or wodtem; default wodtem"},
+    {"train", "--methods", "LIST", "", "several methods, separated by commas, one after the other"},
+    {"train import sweep", "--preset", "NAME", "small", "paper: Tables I and II as printed; small: less of it"},
+    {"train", "--seed", "N", "", "seed of everything but the data set; default 0"},
+    {"train", "--seeds", "A-B", "", "several seeds, one after the other"},
+    {"train import", "--set", "NAME=VALUE", "", "any setting (see `wodtem tasks TASK`); may be repeated"},
+    {"train import trace", "--physics", "NAME", "",
+     "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
+    {"train import check", "--dataset", "FILE", "",
+     "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
+    {"train", "--weights", "MODEL", "",
+     "begin with a model's network, temperature and normaliser, not with random ones"},
+    {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
+    {"train", "--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"},
+    {"eval", "--episodes", "N", "1", "episodes"},
+    {"export", "--odt", nullptr, "",
+     "for load_state_dict(strict=True) of ODT's own code: its names, its unused tensors"},
+    {"import", "--task", "ID", "", "whose network it is; not needed if `wodtem export` made the file"},
+    {"collect", "--out", "FILE", "", "where to write (default: runs/datasets under D4RL's file name)"},
+    {"collect", "--steps", "N", "", "rows (default: as many as D4RL's)"},
+    {"collect", "--policy", "FILE", "", "of a medium or antmaze set (default: the one that this program holds)"},
+    {"collect", "--seed", "N", "0", "of all that is drawn"},
+    {"report", "--out", "DIR", "runs/report", "where to write"},
+    {"sweep", "--methods", "LIST", "dt,odt,wodtem", "methods, separated by commas"},
+    {"sweep", "--seeds", "A-B", "0-4", "seeds"},
+    {"sweep", "--estimate", nullptr, "", "say how long the runs would take, as comments"},
+    {"info", "--task", "ID", "", "of a data set whose name does not tell"},
+    {"check", "-v", nullptr, "", "print inputs, the file's values and the program's"},
+    {"check", "--dump", "FILE", "", "write every tensor of one update of a run instead, as a case of topic step"},
+    {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
+    {"train eval import bench check", "--kernel", "NAME", "auto",
+     "of matrix products: avx512, avx2, portable; auto: the best there is"},
+    {"train eval collect bench check", "--threads", "N", "0",
+     "worker threads; 0: one per core; results do not depend on it"},
+    {"bench", "--json", nullptr, "", "of updates: print one JSON array"},
+};
+
+struct Arguments {
+    std::vector<std::string> words;              // that are not options
+    std::map<std::string, std::string> options;  // all that the command takes; "yes" or "" for a switch
+    std::vector<std::string> assignments;        // of --set, in order
+    const std::string& operator[](const char* name) const { return options.at(name); }
+    bool has(const char* name) const { return !options.at(name).empty(); }
+};
+
+struct Command {
+    const char *name, *words;  // words: how its arguments look in the help
+    size_t least_words, most_words;
+    const char* meaning;
+    void (*run)(const Arguments&);
+    std::string (*notes)() = nullptr;  // what its help says below the options
+};
+
+inline std::vector<Option> options_of(const Command& command) {
+    std::vector<Option> taken;
+    for (const Option& option : option_table) {
+        const std::vector<std::string> takers = split(option.commands, ' ');
+        if (std::find(takers.begin(), takers.end(), command.name) != takers.end()) taken.push_back(option);
+    }
+    return taken;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Parsing and help.
+
+// Errors: usage.option names the nearest option of the command.
+inline const Option& option_named(const Command& command, const std::vector<Option>& taken, const std::string& word) {
+    std::vector<std::string> names;
+    for (const Option& option : taken) {
+        if (word == option.name) return option;
+        names.push_back(option.name);
+    }
+    if (names.empty()) fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, word.c_str());
+    fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, word.c_str(),
+         nearest_name(word, names).c_str());
+}
+
+// Errors: usage.option, usage.words.
+inline Arguments parse_arguments(const Command& command, const std::vector<std::string>& words) {
+    const std::vector<Option> taken = options_of(command);
+    Arguments arguments;
+    for (const Option& option : taken) arguments.options[option.name] = option.fallback;
+    std::set<std::string> seen;
+    for (size_t i = 0; i < words.size(); ++i) {
+        if (!words[i].starts_with("-") || words[i].size() < 2) {
+            arguments.words.push_back(words[i]);
+            continue;
+        }
+        const Option& option = option_named(command, taken, words[i]);
+        if (!option.value) {
+            arguments.options[option.name] = "yes";
+            continue;
+        }
+        if (i + 1 == words.size() || words[i + 1].starts_with("--"))
+            fail("usage.option", "option %s needs a value: %s", option.name, option.value);
+        const std::string& value = words[++i];
+        if (value.empty())
+            fail("usage.option", "option %s needs a value that is not empty: %s", option.name, option.value);
+        if (std::string_view(option.name) == "--set") {
+            arguments.assignments.push_back(value);
+            continue;
+        }
+        if (!seen.insert(option.name).second) fail("usage.option", "option %s is given twice", option.name);
+        arguments.options[option.name] = value;
+    }
+    if (arguments.words.size() < command.least_words || arguments.words.size() > command.most_words)
+        fail("usage.words", "wodtem %s takes %s; %zu argument%s given (wodtem %s --help)", command.name,
+             *command.words ? command.words : "no argument", arguments.words.size(),
+             arguments.words.size() == 1 ? " was" : "s were", command.name);
+    return arguments;
+}
+
+inline void print_command_list(std::span<const Command> commands) {
+    std::printf(
+        "wodtem: decision transformers that go from offline data to online interaction, with an episodic memory\n\n");
+    for (const Command& command : commands)
+        std::printf("  wodtem %-7s %-9s %s\n", command.name, command.words, command.meaning);
+    std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
+}
+
+inline void print_help(const Command& command) {
+    std::printf("wodtem %s %s\n%s\n\n", command.name, command.words, command.meaning);
+    for (const Option& option : options_of(command)) {
+        const std::string left = std::string(option.name) + " " + (option.value ? option.value : "");
+        std::printf("  %-26s %s%s%s\n", left.c_str(), option.meaning, *option.fallback ? "; default " : "",
+                    option.fallback);
+    }
+    if (command.notes) std::printf("%s", command.notes().c_str());
+}
+
+inline void flush_results() {
+    if (std::fflush(stdout) != 0 || std::ferror(stdout))
+        fail("console.write", "cannot write the results to stdout: is the disk full?");
+}
+
+// Returns the exit status. Errors: usage.command, and those of the command.
+inline int run_command_line(std::span<const Command> commands, const std::vector<std::string>& words) {
+    const auto asks_for_help = [](const std::string& word) {
+        return word == "--help" || word == "-h" || word == "help";
+    };
+    if (words.empty() || asks_for_help(words[0])) {
+        print_command_list(commands);
+        flush_results();
+        return words.empty() ? 2 : 0;
+    }
+    std::vector<std::string> names;
+    for (const Command& command : commands) {
+        names.push_back(command.name);
+        if (words[0] != command.name) continue;
+        const std::vector<std::string> rest(words.begin() + 1, words.end());
+        if (std::any_of(rest.begin(), rest.end(), asks_for_help))
+            print_help(command);
+        else
+            command.run(parse_arguments(command, rest));
+        flush_results();
+        return 0;
+    }
+    fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(),
+         nearest_name(words[0], names).c_str());
+}
+
+// The body of main(): every error becomes a sentence on stderr and an exit status.
+inline int run_program(std::span<const Command> commands, const std::vector<std::string>& words) {
+    std::signal(SIGPIPE, SIG_IGN);  // write() then returns an error, which becomes a sentence
+    std::signal(SIGXFSZ, SIG_IGN);  // the same for a limit on file sizes
+    try {
+        return run_command_line(commands, words);
+    } catch (const Error& error) {
+        std::fprintf(stderr, "wodtem: %s\n", error.what());
+        return error.id.starts_with("usage.") ? 2 : 1;
+    } catch (const std::bad_alloc&) {
+        std::fprintf(stderr, "wodtem: out of memory\n");
+    } catch (const std::exception& error) {
+        std::fprintf(stderr, "wodtem: %s\n", error.what());
+    }
+    return 1;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Values.
+
+// Errors: usage.number.
+inline int64_t whole_number(const std::string& text, const char* name, int64_t low, int64_t high) {
+    const std::optional<double> x = to_number(text);
+    const double least = static_cast<double>(low), most = static_cast<double>(high);
+    if (!x || *x != std::floor(*x) || *x < least || *x > most)
+        fail("usage.number", "%s cannot be \"%s\"; it is a whole number from %lld to %lld; the nearest is %.0f", name,
+             text.c_str(), static_cast<long long>(low), static_cast<long long>(high),
+             std::round(std::clamp(x.value_or(least), least, most)));
+    return static_cast<int64_t>(*x);
+}
+
+// "3", "0-4" or "1,3,8". Errors: usage.number.
+inline std::vector<int64_t> seed_list(const std::string& text) {
+    std::vector<int64_t> seeds;
+    for (const std::string& range : split(text, ',')) {
+        const size_t dash = range.find('-', 1);
+        const int64_t first = whole_number(range.substr(0, dash), "a seed", 0, 4294967295);
+        const int64_t last =
+            dash == std::string::npos ? first : whole_number(range.substr(dash + 1), "a seed", 0, 4294967295);
+        if (last < first || last - first > 9999)
+            fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", range.c_str());
+        for (int64_t seed = first; seed <= last; ++seed) {
+            if (std::find(seeds.begin(), seeds.end(), seed) != seeds.end())
+                fail("usage.number", "seed %lld is given twice in \"%s\"", static_cast<long long>(seed), text.c_str());
+            seeds.push_back(seed);
+        }
+    }
+    return seeds;
+}
+
+// Of two options that exclude each other, "one" and "several of it", the list of values.
+inline std::string one_or_several(const Arguments& arguments, const char* one, const char* several,
+                                  const char* fallback) {
+    if (arguments.has(one) && arguments.has(several))
+        fail("usage.option", "%s and %s were both given; choose one", one, several);
+    return arguments.has(several) ? arguments[several] : arguments.has(one) ? arguments[one] : fallback;
+}
+
+// The processors that this process may use: those of its affinity mask, or fewer where a container limits its share of
+// time (Linux: cpu.max holds "QUOTA PERIOD", or "max PERIOD").
+inline int processor_count() {
+    const int processors = static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
+    std::ifstream limits("/sys/fs/cgroup/cpu.max");
+    double quota = 0, period = 0;
+    if (!(limits >> quota >> period) || !(quota > 0 && period > 0)) return processors;
+    return std::clamp(static_cast<int>(std::ceil(quota / period)), 1, processors);
+}
+
+inline int thread_count(const Arguments& arguments) {
+    const int64_t asked = whole_number(arguments["--threads"], "--threads", 0, 256);
+    return asked > 0 ? static_cast<int>(asked) : processor_count();
+}
+
+// The kernel of --kernel. Errors: usage.kernel names those of this machine.
+inline const Kernel& kernel_of(const Arguments& arguments) {
+    const std::string& name = arguments["--kernel"];
+    std::string available;
+    for (const Kernel* kernel : kernels) {
+        if (!kernel->supported()) continue;
+        if (name == "auto" || name == kernel->name) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name;
+    }
+    fail("usage.kernel", "kernel \"%s\" is not there; this machine has: %s (or auto)", name.c_str(), available.c_str());
+}
+
+// The best kernel that gives the bits of a run's setting `arithmetic`. Errors: usage.kernel.
+inline const Kernel& kernel_for(const std::string& arithmetic) {
+    for (const Kernel* kernel : kernels)
+        if (kernel->supported() && arithmetic == kernel->arithmetic) return *kernel;
+    fail("usage.kernel", "this machine has no kernel of arithmetic %s", arithmetic.c_str());
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Settings from the command line.
+
+// given: a file; "random": none, so ten episodes of random actions and the online phase alone; "": the file of the
+// task's id, where a data set has that name. Errors: dataset.missing.
+inline void choose_data_set(Settings& settings, const std::string& given) {
+    const PublishedDataSet* published = find_published(settings.task);
+    if (given == "random" || (given.empty() && !published)) {
+        set_from(settings, "behaviour", "random", "chosen: there is no data set");
+        if (settings.method != "dt")
+            set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
+        return;
+    }
+    settings.dataset_path = given.empty() ? find_data_set(*published) : given;
+    settings.dataset_sha256 = sha256_of_file(settings.dataset_path);
+    settings.dataset = std::filesystem::path(settings.dataset_path).filename();
+    const bool original = published && settings.dataset_sha256 == published->sha256;
+    settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
+}
+
+// NAME=VALUE of each --set. Errors: usage.setting.
+inline void apply_assignments(Settings& settings, const std::vector<std::string>& assignments) {
+    constexpr const char* fixed[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
+                                     "mujoco", "dataset", "dataset_sha256", "first_weights"};
+    std::set<std::string> seen;
+    for (const std::string& assignment : assignments) {
+        const size_t equals = assignment.find('=');
+        if (equals == std::string::npos)
+            fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
+        const std::string name = setting_row(assignment.substr(0, equals)).name;
+        if (std::find(std::begin(fixed), std::end(fixed), name) != std::end(fixed))
+            fail("usage.setting", "%s is not given by --set; see wodtem train --help", name.c_str());
+        if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
+        set_from(settings, name, assignment.substr(equals + 1), "command line");
+    }
+}
+
+// The settings of one run, for the options that train and import share. Errors: usage.*, dataset.missing.
+inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method,
+                            int64_t seed) {
+    Settings settings = default_settings(task, method, arguments["--preset"]);
+    settings.seed = seed;
+    if (settings.task != "gridworld") {
+        settings.mujoco = mujoco_version();
+        choose_data_set(settings, arguments["--dataset"]);
+    }
+    if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
+    apply_assignments(settings, arguments.assignments);
+    check_together(settings);
+    settings.arithmetic = kernel_of(arguments).arithmetic;
+    return settings;
+}
+
+// Of a network to import: those in the file, or with --task those of the command line. Errors: usage.*, settings.*.
+inline Settings imported_settings(const Arguments& arguments, const TensorFile& file) {
+    if (arguments.has("--task")) return settings_of(arguments, arguments["--task"], arguments["--method"], 0);
+    if (file.metadata.contains("settings")) return settings_in(file);
+    fail("usage.option", "%s does not tell its settings; give --task, and --method, --preset, --set as in train",
+         file.path.c_str());
+}
+
+// One of the runs that a train command asks for.
+struct PlannedRun {
+    Settings settings;
+    std::string folder, label;  // label: "2 of 3: ODT, seed 0", or without the count if it is the only run
+};
+
+inline std::string method_label(const std::string& method) {
+    return method == "dt" ? "DT" : method == "odt" ? "ODT" : "WODTEM";
+}
+
+// --out, or runs/TASK-PRESET-METHOD-SEED; several runs in one --out have folders of their own below it.
+inline std::string folder_of(const Arguments& arguments, const Settings& settings) {
+    if (!arguments.has("--out"))
+        return "runs/" + settings.task + "-" + settings.preset + "-" + settings.method + "-" +
+               std::to_string(settings.seed);
+    return arguments["--out"] + (arguments.has("--methods") ? "/" + settings.method : "") +
+           (arguments.has("--seeds") ? "/seed-" + std::to_string(settings.seed) : "");
+}
+
+// Every method with every seed, all checked before the first begins. Errors: usage.*, dataset.missing, file.*.
+inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
+    const std::vector<std::string> methods = split(one_or_several(arguments, "--method", "--methods", "wodtem"), ',');
+    const std::vector<int64_t> seeds = seed_list(one_or_several(arguments, "--seed", "--seeds", "0"));
+    std::vector<PlannedRun> runs;
+    for (const std::string& method : methods) {
+        for (const int64_t seed : seeds) {
+            Settings settings = settings_of(arguments, arguments.words[0], method, seed);
+            if (arguments.has("--weights")) {
+                settings.weights_path = model_path(arguments["--weights"]);
+                set_from(settings, "first_weights", sha256_of_file(settings.weights_path), "SHA-256 of the model file");
+            }
+            const std::string label = method_label(method) + ", seed " + std::to_string(seed);
+            runs.push_back({settings, folder_of(arguments, settings), label});
+        }
+    }
+    for (size_t i = 0; runs.size() > 1 && i < runs.size(); ++i)
+        runs[i].label = std::to_string(i + 1) + " of " + std::to_string(runs.size()) + ": " + runs[i].label;
+    return runs;
+}
+
+inline void announce(const PlannedRun& run) {
+    std::fprintf(stderr, "%s: trains on %s, preset %s, in %s; all its settings: %s/settings\n", run.label.c_str(),
+                 run.settings.task.c_str(), run.settings.preset.c_str(), run.folder.c_str(), run.folder.c_str());
+}
+
+// One for each method of a sweep, all checked. Errors: usage.*.
+inline std::vector<Settings> swept_settings(const Arguments& arguments) {
+    std::vector<Settings> sweep;
+    for (const std::string& method : split(arguments["--methods"], ',')) {
+        const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
+        sweep.push_back(default_settings(task, method, arguments["--preset"]));
+        check_together(sweep.back());
+    }
+    return sweep;
+}
+
+// One train command a line; in an estimate all lines are comments. seconds: of one seed of each method.
+inline void print_sweep(const std::vector<Settings>& sweep, const std::vector<int64_t>& seeds, bool estimate,
+                        double seconds) {
+    for (const Settings& settings : sweep)
+        for (const int64_t seed : seeds)
+            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld\n", estimate ? "# " : "",
+                        settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
+                        static_cast<long long>(seed));
+    if (estimate)
+        std::printf("# about %.1f hours on this machine, one after the other; what is interrupted continues\n",
+                    seconds * static_cast<double>(seeds.size()) / 3600);
+}
+
+// The help of train: every setting.
+inline std::string settings_help() {
+    std::string text = "\nSettings for --set, with the values of preset paper:\n";
+    const Settings settings;
+    for (const SettingRow& row : setting_rows) {
+        char line[300];
+        std::snprintf(line, sizeof line, "  %-24s %-12s %s\n", row.name, setting_text(settings, row).c_str(),
+                      row.source);
+        text += line;
+    }
+    return text;
+}

@@ -1,0 +1,102 @@
+// console.hpp: what a person sees of a long command, on stderr: a bar on a terminal, elsewhere a line for each tenth of
+// the way; and the request to stop.
+#pragma once
+
+#include <sys/ioctl.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <chrono>
+#include <csignal>
+#include <cstdio>
+#include <string>
+
+using Clock = std::chrono::steady_clock;
+
+inline double seconds_since(Clock::time_point then) {
+    return std::chrono::duration<double>(Clock::now() - then).count();
+}
+
+// 75 seconds are 1:15, 3675 are 1:01:15.
+inline std::string clock_text(double seconds) {
+    const int whole = static_cast<int>(std::clamp(seconds, 0.0, 3599999.0));
+    char text[32];
+    if (whole >= 3600)
+        std::snprintf(text, sizeof text, "%d:%02d:%02d", whole / 3600, whole / 60 % 60, whole % 60);
+    else
+        std::snprintf(text, sizeof text, "%d:%02d", whole / 60, whole % 60);
+    return text;
+}
+
+// Set by SIGINT and SIGTERM: a long command then saves its state and ends. A signal handler can reach nothing but a
+// global variable; this is the only one.
+inline volatile std::sig_atomic_t stop_requested = 0;
+
+inline void stop_on_signals() {
+    for (const int signal : {SIGINT, SIGTERM}) {
+        std::signal(signal, [](int number) {
+            stop_requested = 1;
+            std::signal(number, SIG_DFL);  // a second signal ends the process at once
+        });
+    }
+}
+
+struct Console {
+    const bool terminal = isatty(STDERR_FILENO) != 0;
+    std::string label = "";  // begins each line
+    std::string phase = "";  // of the latest line
+    Clock::time_point phase_began = Clock::now();
+    Clock::time_point shown = phase_began - std::chrono::hours(1);
+    double first_share = 0;  // of the phase, when this process began it
+    int tenth = -1;          // of the phase, at the latest line
+
+    // share: how much of the phase is done, 0 to 1. later: seconds expected after the phase. details(): the line's end,
+    // called only when a line is drawn.
+    template <class Details>
+    void show(const std::string& new_phase, double share, double later, Details&& details) {
+        if (phase != new_phase) {
+            phase = new_phase;
+            phase_began = Clock::now();
+            first_share = share;
+            tenth = -1;
+        }
+        const int new_tenth = static_cast<int>(share * 10);
+        const bool too_soon = terminal ? seconds_since(shown) < 0.1 && share < 1 : new_tenth == tenth;
+        if (too_soon) return;
+        shown = Clock::now();
+        tenth = new_tenth;
+        draw(share, later, details());
+    }
+
+    void draw(double share, double later, const std::string& details) const {
+        std::string text = label + ", " + phase + " " + bar(share);
+        if (share > first_share && (share < 1 || later > 0)) {
+            const double left = seconds_since(phase_began) / (share - first_share) * (1 - share);
+            text += " " + clock_text(left + later) + " left,";
+        }
+        text += " " + details;
+        if (!terminal) {
+            std::fprintf(stderr, "%s\n", text.c_str());
+            return;
+        }
+        text.resize(std::min(text.size(), columns() - 1));  // a line that wraps cannot be drawn over
+        std::fprintf(stderr, "\r%s\033[K%s", text.c_str(), share >= 1 ? "\n" : "");
+    }
+
+    std::string bar(double share) const {
+        const size_t width = 12, filled = static_cast<size_t>(share * static_cast<double>(width));
+        char percent[16];
+        std::snprintf(percent, sizeof percent, "%3.0f%%", 100 * share);
+        return terminal ? "[" + std::string(filled, '#') + std::string(width - filled, '.') + "]" + percent : percent;
+    }
+
+    static size_t columns() {
+        winsize size{};
+        return ioctl(STDERR_FILENO, TIOCGWINSZ, &size) == 0 && size.ws_col > 20 ? size.ws_col : 80;
+    }
+
+    // Leaves the bar's line before something else is printed.
+    void end_line() const {
+        if (terminal) std::fprintf(stderr, "\n");
+    }
+};

@@ -1,0 +1,314 @@
+// model_file.hpp: a trained model as a safetensors file, and the same weights under the names of ODT's own code.
+//
+// A model file holds the network's parameters under ODT's names, `log_temperature` [], `state_mean` and `state_std`
+// [state_dim], and in its metadata the format, the settings and the counts of updates and interactions: all that `eval`
+// needs. A file for ODT's code holds exactly what a strict load_state_dict of its model expects, that is also tensors
+// which it neither trains nor uses; what it has no place for goes into the metadata, as decimal text that reads back
+// exactly.
+// Promises: a file is checked against the network of its settings before anything of it is used; errors name the file
+// and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
+#pragma once
+
+#include <algorithm>
+#include <charconv>
+#include <cmath>
+#include <cstdint>
+#include <filesystem>
+#include <set>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "safetensors.hpp"
+#include "settings.hpp"
+
+// Where the contents of a model file lie in memory; reading writes to these places.
+struct ModelContents {
+    const Settings& settings;
+    const TransformerConfig& config;
+    std::vector<Parameter<float>>& parameters;
+    Parameter<float>& log_temperature;
+    std::vector<float>&state_mean, &state_std;  // [config.state_dim]
+    uint64_t updates = 0, interactions = 0;
+};
+
+inline void add_parameters(TensorFile& file, const ModelContents& model) {
+    for (const Parameter<float>& parameter : model.parameters)
+        file.add(parameter.name, parameter.shape, parameter.value);
+}
+
+inline void add_metadata(TensorFile& file, const ModelContents& model, const std::string& format) {
+    file.metadata["format"] = format;
+    file.metadata["settings"] = settings_text(model.settings);
+    file.metadata["updates"] = std::to_string(model.updates);
+    file.metadata["interactions"] = std::to_string(model.interactions);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The model file.
+
+inline constexpr const char* model_format = "wodtem model 1";
+
+inline void save_model(const ModelContents& model, const std::string& path) {
+    TensorFile file;
+    add_metadata(file, model, model_format);
+    add_parameters(file, model);
+    file.add(model.log_temperature.name, {}, model.log_temperature.value);
+    file.add("state_mean", {model.state_mean.size()}, model.state_mean);
+    file.add("state_std", {model.state_std.size()}, model.state_std);
+    write_safetensors(path, file);
+}
+
+// "a", "b" and 3 more; for messages.
+inline std::string some_names(const std::vector<std::string>& names) {
+    std::string text;
+    for (size_t i = 0; i < std::min<size_t>(names.size(), 8); ++i) text += (i > 0 ? ", " : "") + json_string(names[i]);
+    return text + (names.size() > 8 ? " and " + std::to_string(names.size() - 8) + " more" : "");
+}
+
+// Demands that the file has the network's tensors, and no others but those of `optional`.
+// Errors: model.names names the missing and the unknown ones.
+inline void require_names(const TensorFile& file, const ModelContents& model, const std::set<std::string>& optional) {
+    std::set<std::string> known = optional;
+    std::vector<std::string> missing, unknown;
+    for (const Parameter<float>& parameter : model.parameters) {
+        known.insert(parameter.name);
+        if (!file.has(parameter.name)) missing.push_back(parameter.name);
+    }
+    for (const StoredTensor& tensor : file.tensors)
+        if (!known.contains(tensor.name)) unknown.push_back(tensor.name);
+    if (missing.empty() && unknown.empty()) return;
+    fail("model.names",
+         "%s: does not hold the network of its settings: %s%s%s%s; are layers, position and method right?",
+         file.path.c_str(), missing.empty() ? "" : "missing ", some_names(missing).c_str(),
+         unknown.empty() ? "" : (missing.empty() ? "unknown " : "; unknown "), some_names(unknown).c_str());
+}
+
+// Errors: those of TensorFile::read_into, for a shape or dtype that is not the network's.
+inline void load_parameters(ModelContents& model, const TensorFile& file) {
+    for (Parameter<float>& parameter : model.parameters)
+        file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
+}
+
+// Errors: model.value names the tensor that holds a number no network can have.
+inline void check_model(const ModelContents& model, const std::string& path) {
+    const auto require = [&](bool holds, const std::string& name, const char* property) {
+        if (!holds)
+            fail("model.value", "%s: tensor %s holds a number that is not %s", path.c_str(), name.c_str(), property);
+    };
+    for (const Parameter<float>& parameter : model.parameters)
+        for (const float value : parameter.value) require(std::isfinite(value), parameter.name, "finite");
+    require(std::isfinite(std::exp(model.log_temperature.value[0])), "log_temperature",
+            "finite, nor is its exponential");
+    for (const float value : model.state_mean) require(std::isfinite(value), "state_mean", "finite");
+    for (const float value : model.state_std)
+        require(std::isfinite(value) && value > 0, "state_std", "finite and positive");
+}
+
+// The counts in the metadata; 0 where the file does not state them. Errors: import.metadata.
+inline void load_counts(ModelContents& model, const TensorFile& file) {
+    const auto count = [&](const char* name) -> uint64_t {
+        const auto found = file.metadata.find(name);
+        if (found == file.metadata.end()) return 0;
+        const std::optional<double> x = to_number(found->second);
+        if (!x || *x < 0 || *x > 1e15 || *x != std::floor(*x))
+            fail("import.metadata", "%s: metadata entry %s is \"%s\", not a number of %s", file.path.c_str(), name,
+                 found->second.substr(0, 80).c_str(), name);
+        return static_cast<uint64_t>(*x);
+    };
+    model.updates = count("updates");
+    model.interactions = count("interactions");
+}
+
+// Reads what save_model() wrote. Errors: model.names, model.value, import.metadata, safetensors.*.
+inline void load_model(ModelContents& model, const TensorFile& file) {
+    const uint64_t state_dim = static_cast<uint64_t>(model.config.state_dim);
+    require_names(file, model, {"log_temperature", "state_mean", "state_std"});
+    load_parameters(model, file);
+    file.read_into(std::span(model.log_temperature.value), "log_temperature", {});
+    model.state_mean = file.get<float>("state_mean", {state_dim});
+    model.state_std = file.get<float>("state_std", {state_dim});
+    check_model(model, file.path);
+    load_counts(model, file);
+}
+
+// The settings in a file's metadata. Errors: settings.*, safetensors.metadata.
+inline Settings settings_in(const TensorFile& file) { return settings_from_text(file.text("settings"), file.path); }
+
+// Demands that a file is large enough for the network of its settings, before a network of that size is allocated.
+// Errors: model.settings.
+inline void require_room(const TensorFile& file, const Settings& settings) {
+    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
+    if (settings.width % settings.heads != 0 || static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
+        fail("model.settings", "%s: does not hold the %lld weights and more that its settings call for",
+             file.path.c_str(), static_cast<long long>(weights));
+}
+
+// `given`: a model file, or a run's folder.
+inline std::string model_path(const std::string& given) {
+    return std::filesystem::is_directory(given) ? given + "/model.safetensors" : given;
+}
+
+// Errors: model.format, model.settings, safetensors.*, file.*.
+inline TensorFile open_model(const std::string& given) {
+    const std::string path = model_path(given);
+    TensorFile file = read_safetensors(path);
+    const auto format = file.metadata.find("format");
+    if (format == file.metadata.end() || format->second != model_format)
+        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
+    require_room(file, settings_in(file));
+    return file;
+}
+
+// Reads the first network of a run from a model of the same shape. Errors: model.settings, and those of load_model().
+inline void load_first_weights(ModelContents& model, const TensorFile& file) {
+    const Settings theirs = settings_in(file);
+    for (const char* name : {"layers", "heads", "width", "position", "state_encoding"}) {
+        const SettingRow& row = setting_row(name);
+        if (setting_text(theirs, row) != setting_text(model.settings, row))
+            fail("model.settings", "%s has %s = %s, the run %s; make them equal with --set", file.path.c_str(), name,
+                 setting_text(theirs, row).c_str(), setting_text(model.settings, row).c_str());
+    }
+    load_model(model, file);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// ODT's state_dict.
+
+struct UnusedTensor {
+    std::string name;
+    Shape shape;
+};
+
+// ODT's code: GPT-2's vocabulary of one word; max_ep_len 1000; causal masks for n_positions 1024; heads for state and
+// return, which no loss reads.
+inline std::vector<UnusedTensor> unused_odt_tensors(const TransformerConfig& config) {
+    const uint64_t d = static_cast<uint64_t>(config.width), S = static_cast<uint64_t>(config.state_dim);
+    std::vector<UnusedTensor> unused = {{"transformer.wte.weight", {1, d}}, {"embed_timestep.weight", {1000, d}},
+                                        {"predict_state.weight", {S, d}},   {"predict_state.bias", {S}},
+                                        {"predict_return.weight", {1, d}},  {"predict_return.bias", {1}}};
+    for (int layer = 0; layer < config.layers; ++layer) {
+        const std::string attention = "transformer.h." + std::to_string(layer) + ".attn.";
+        unused.push_back({attention + "bias", {1, 1, 1024, 1024}});
+        unused.push_back({attention + "masked_bias", {}});
+    }
+    return unused;
+}
+
+inline std::string numbers_text(const std::vector<float>& values) {
+    std::string text;
+    for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
+    return text;
+}
+
+inline void add_unused(TensorFile& file, const UnusedTensor& unused) {
+    size_t size = 1;
+    for (const uint64_t extent : unused.shape) size *= extent;
+    if (unused.name.ends_with(".attn.bias")) {
+        std::vector<uint8_t> causal_mask(size);  // [1, 1, query, key]
+        for (size_t i = 0; i < size; ++i) causal_mask[i] = i % 1024 <= i / 1024;
+        file.add(unused.name, unused.shape, causal_mask);
+    } else {
+        const float value = unused.name.ends_with(".masked_bias") ? -1e4f : 0.0f;
+        file.add(unused.name, unused.shape, std::vector<float>(size, value));
+    }
+}
+
+// Everything that a strict load_state_dict of ODT's model expects, and nothing else.
+inline TensorFile odt_file(const ModelContents& model) {
+    TensorFile file;
+    add_metadata(file, model, "ODT state_dict");
+    file.metadata["log_temperature"] = numbers_text(model.log_temperature.value);
+    file.metadata["state_mean"] = numbers_text(model.state_mean);
+    file.metadata["state_std"] = numbers_text(model.state_std);
+    add_parameters(file, model);
+    for (const UnusedTensor& unused : unused_odt_tensors(model.config)) add_unused(file, unused);
+    return file;
+}
+
+// The numbers of a tensor, or of the metadata entry of its name, where they are separated by spaces; nothing if the
+// file has neither. Errors: import.metadata.
+inline std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape,
+                                         size_t size) {
+    if (file.has(name)) return file.get<float>(name, shape);
+    if (!file.metadata.contains(name)) return {};
+    std::vector<float> values;
+    for (const std::string& word : split(file.text(name), ' ')) {
+        float value = NAN;
+        const char* end = word.data() + word.size();
+        if (std::from_chars(word.data(), end, value).ptr != end) value = NAN;
+        values.push_back(value);
+    }
+    const auto finite = [](float x) { return std::isfinite(x); };
+    if (values.size() != size || !std::all_of(values.begin(), values.end(), finite))
+        fail("import.metadata", "%s: metadata entry %s is not %zu finite number%s separated by spaces",
+             file.path.c_str(), name.c_str(), size, size == 1 ? "" : "s");
+    return values;
+}
+
+// Reads a file from ODT's code or from odt_file(). Returns whether the file has the statistics of the states; without
+// them the caller must find them elsewhere, and then call check_model(). Errors: model.names, import.metadata.
+inline bool load_odt(ModelContents& model, const TensorFile& file) {
+    std::set<std::string> optional = {"log_temperature", "state_mean", "state_std"};
+    for (const UnusedTensor& unused : unused_odt_tensors(model.config)) optional.insert(unused.name);
+    require_names(file, model, optional);
+    load_parameters(model, file);
+    load_counts(model, file);
+    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {}, 1);
+    if (!log_temperature.empty()) model.log_temperature.value = log_temperature;
+    const size_t state_dim = static_cast<size_t>(model.config.state_dim);
+    model.state_mean = tensor_or_text(file, "state_mean", {state_dim}, state_dim);
+    model.state_std = tensor_or_text(file, "state_std", {state_dim}, state_dim);
+    if (model.state_mean.empty() != model.state_std.empty())
+        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
+             file.path.c_str());
+    return !model.state_mean.empty();
+}
+
+// A model in memory that neither trains nor acts.
+struct StoredModel {
+    Settings settings;
+    EnvironmentSpec spec = spec_of(settings);
+    Transformer<float> network{transformer_config(settings, spec), 0};
+    Parameter<float> log_temperature{
+        "log_temperature", {1}, {std::log(static_cast<float>(settings.initial_lambda))}, {0}};
+    std::vector<float> state_mean = {}, state_std = {};
+
+    ModelContents contents() {
+        return {settings, network.config, network.parameters, log_temperature, state_mean, state_std};
+    }
+};
+
+// The command `export --odt`: from a model file (or run folder) to `out`.
+inline void export_odt(const std::string& given, const std::string& out) {
+    const TensorFile file = open_model(given);
+    StoredModel model{settings_in(file)};
+    ModelContents contents = model.contents();
+    load_model(contents, file);
+    const TensorFile exported = odt_file(contents);
+    write_safetensors(out, exported);
+    std::printf(
+        "%s: %zu tensors for a strict load_state_dict of ODT's model%s\n", out.c_str(), exported.tensors.size(),
+        model.spec.discrete_actions > 0 ? ", were there not predict_action.logits: ODT has no discrete actions" : "");
+}
+
+// The command `import`: from a file under ODT's names to a model file. find_statistics(model) is called if the file has
+// none of the states. Errors: model.*, import.*, safetensors.*.
+template <class FindStatistics>
+void import_odt(const TensorFile& file, const Settings& settings, const std::string& out,
+                FindStatistics&& find_statistics) {
+    require_room(file, settings);
+    StoredModel model{settings};
+    ModelContents contents = model.contents();
+    if (!load_odt(contents, file)) {
+        if (settings.behaviour == "random")
+            fail("import.normaliser",
+                 "%s has no state_mean and state_std, and there is no data set to take them from; see --dataset",
+                 file.path.c_str());
+        find_statistics(model);
+    }
+    check_model(contents, file.path);
+    save_model(contents, out);
+    std::printf("%s: %s, %s, for wodtem eval and wodtem train --weights\n", out.c_str(), settings.task.c_str(),
+                settings.method.c_str());
+}

@@ -1,0 +1,391 @@
+// run_folder.hpp: a run is a folder. What stands in it, and how a run that was interrupted continues:
+//
+//   settings                 the settings, each with its source (settings.hpp); written first
+//   progress.csv             a row for each evaluation        grows
+//   episodes.csv             a row for each online episode    grows
+//   checkpoint.safetensors   the whole state, while the run is unfinished
+//   model.safetensors        the trained model (model_file.hpp)
+//   policy.csv, start_actions.csv (grid world), paths.csv (mazes): what the report's figures need
+//   finished                 empty; written last
+//
+// Promises: the checkpoint notes the length and the checksum of both logs, and continuing cuts them back to it, so an
+// interrupted run ends with the same bytes; a folder of other settings is left as it is; one process at a time works in
+// a folder. Leaves out: what the state of a run is (the caller visits it).
+#pragma once
+
+#include <sys/file.h>
+
+#include <array>
+#include <cerrno>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <filesystem>
+#include <string>
+#include <vector>
+
+#include "../gridworld.hpp"
+#include "../mujoco_env.hpp"
+#include "console.hpp"
+#include "safetensors.hpp"
+#include "settings.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Rows of the logs.
+
+inline constexpr const char* progress_header =
+    "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
+    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,physics\n";
+inline constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions,physics\n";
+
+// Sums since the latest row of progress.csv.
+struct Tally {
+    double loss = 0, entropy = 0, gradient_norm = 0, updates = 0;
+    double pairs = 0, short_pairs = 0, unmatched_pairs = 0;  // looked up; with d < e-hat; without a neighbour
+    double matched = 0, evicted = 0;  // states that the table already held; entries that it gave up
+    double rollout_length = 0, rollout_return = 0, rollouts = 0;
+    double dropped = 0;  // episodes whose simulation broke down
+
+    template <class Archive>
+    void visit(Archive& archive) {
+        archive("progress.loss", loss);
+        archive("progress.entropy", entropy);
+        archive("progress.gradient_norm", gradient_norm);
+        archive("progress.summed_updates", updates);
+        archive("progress.pairs", pairs);
+        archive("progress.short_pairs", short_pairs);
+        archive("progress.unmatched_pairs", unmatched_pairs);
+        archive("progress.matched", matched);
+        archive("progress.evicted", evicted);
+        archive("progress.rollout_length", rollout_length);
+        archive("progress.rollout_return", rollout_return);
+        archive("progress.rollouts", rollouts);
+        archive("progress.dropped", dropped);
+    }
+};
+
+struct ProgressRow {
+    bool online;
+    uint64_t updates, interactions, episodes;
+    double learning_rate, lambda;  // lambda: NaN where the entropy is not constrained
+    size_t memory_size;
+    double eval_length, eval_return, eval_score;
+    Tally tally;
+};
+
+struct EpisodeRow {
+    uint64_t episode, interactions;
+    const Trajectory& trajectory;  // with its returns
+    bool discrete;                 // the actions are moves of the grid world
+};
+
+inline std::string csv_line(const std::vector<std::string>& fields) {
+    std::string line;
+    for (const std::string& field : fields) line += (line.empty() ? "" : ",") + field;
+    return line + "\n";
+}
+
+// The last column: which simulation the numbers belong to.
+inline std::string physics_text(const Settings& settings) {
+    return settings.task == "gridworld" ? "grid world" : settings.physics + " on MuJoCo " + settings.mujoco;
+}
+
+// ", normalised score 12.3" for the tasks that have one.
+inline std::string score_text(const Settings& settings, double total_return) {
+    const MujocoTask* task = find_mujoco_task(settings.task);
+    return task ? ", normalised score " + number_text(static_cast<float>(normalised_score(*task, total_return))) : "";
+}
+
+inline std::string progress_line(const ProgressRow& row, const Settings& settings) {
+    const Tally& t = row.tally;
+    const auto mean = [](double sum, double count) {  // to seven digits
+        return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");
+    };
+    const bool has_entropy = settings.method != "dt";
+    return csv_line({row.online ? "online" : "offline",
+                     std::to_string(row.updates),
+                     std::to_string(row.interactions),
+                     std::to_string(row.episodes),
+                     number_text(row.learning_rate),
+                     mean(t.loss, t.updates),
+                     mean(t.entropy, has_entropy ? t.updates : 0),
+                     has_entropy ? number_text(static_cast<float>(row.lambda)) : "nan",
+                     mean(t.gradient_norm, t.updates),
+                     mean(t.short_pairs, t.pairs),
+                     mean(t.unmatched_pairs, t.pairs),
+                     std::to_string(row.memory_size),
+                     number_text(row.eval_length),
+                     number_text(row.eval_return),
+                     number_text(row.eval_score),
+                     mean(t.rollout_length, t.rollouts),
+                     mean(t.rollout_return, t.rollouts),
+                     number_text(t.matched),
+                     number_text(t.evicted),
+                     number_text(t.dropped),
+                     physics_text(settings)});
+}
+
+// The command `eval`: means over the episodes without an error, and on the grid world the first episode's moves.
+inline void print_evaluation(const Settings& settings, const std::vector<Episode>& episodes, double mean_length,
+                             double mean_return) {
+    size_t count = 0;
+    for (const Episode& episode : episodes) {
+        count += episode.error.empty();
+        if (!episode.error.empty()) std::fprintf(stderr, "wodtem: an episode is dropped: %s\n", episode.error.c_str());
+    }
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s over %zu episode%s (%s)\n", settings.task.c_str(),
+                settings.method.c_str(), static_cast<long long>(settings.seed), number_text(mean_length).c_str(),
+                number_text(mean_return).c_str(), score_text(settings, mean_return).c_str(), count,
+                count == 1 ? "" : "s", physics_text(settings).c_str());
+    if (settings.task != "gridworld") return;
+    std::printf("first episode:");
+    for (const float move : episodes[0].trajectory.actions)
+        std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
+    std::printf("\n");
+}
+
+// The numbers that end a line of progress on the console.
+inline std::string status_text(const ProgressRow& row, double updates_a_second) {
+    const auto shown = [](const char* format, double x) {
+        char text[60] = "";
+        if (std::isfinite(x)) std::snprintf(text, sizeof text, format, x);
+        return std::string(text);
+    };
+    const Tally& t = row.tally;
+    const double updates = t.updates > 0 ? t.updates : NAN;
+    return shown("update %.0f", static_cast<double>(row.updates)) +
+           (row.online ? shown(", interaction %.0f", static_cast<double>(row.interactions)) : "") +
+           shown(", loss %.3g", t.loss / updates) + shown(", evaluation: length %.4g", row.eval_length) +
+           shown(", return %.3g", row.eval_return) + shown(", %.0f updates a second", updates_a_second);
+}
+
+inline std::string episode_line(const EpisodeRow& row, const Settings& settings) {
+    std::string moves;  // a digit each
+    if (row.discrete)
+        for (const float action : row.trajectory.actions) moves += static_cast<char>('0' + static_cast<int>(action));
+    return csv_line({std::to_string(row.episode), std::to_string(row.interactions),
+                     std::to_string(row.trajectory.length()), number_text(total_return(row.trajectory)),
+                     row.trajectory.terminated ? "1" : "0", moves, physics_text(settings)});
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The folder and its logs.
+
+// A file that grows by lines. Length and checksum are part of the checkpoint.
+struct Log {
+    std::string path;
+    uint64_t bytes = 0, crc = 0;
+
+    void append(const std::string& line) {
+        AppendFile(path).append(line);
+        bytes += line.size();
+        crc = crc32(line, static_cast<uint32_t>(crc));
+    }
+    void begin(const char* header) {
+        write_file_atomic(path, "");
+        bytes = crc = 0;
+        append(header);
+    }
+    void sync() const { AppendFile(path).sync(); }
+
+    // Errors: run.log, if the file does not begin with what it held at the checkpoint.
+    void check() const {
+        const std::string text = std::filesystem::exists(path) ? read_file(path) : "";
+        if (text.size() < bytes || crc32(std::string_view(text).substr(0, bytes)) != crc)
+            fail("run.log",
+                 "%s is not what it was at the checkpoint (%llu bytes); restore it, or remove the folder to start anew",
+                 path.c_str(), static_cast<unsigned long long>(bytes));
+    }
+};
+
+struct RunFolder {
+    std::string path;
+    Log progress{file("progress.csv")}, episodes{file("episodes.csv")};
+
+    std::string file(const char* name) const { return path + "/" + name; }
+    bool has(const char* name) const { return std::filesystem::exists(file(name)); }
+
+    void begin_logs() {
+        progress.begin(progress_header);
+        episodes.begin(episodes_header);
+    }
+    void sync_logs() const {
+        progress.sync();
+        episodes.sync();
+    }
+    template <class Archive>
+    void visit(Archive& archive) {
+        archive("progress.progress_bytes", progress.bytes);
+        archive("progress.episodes_bytes", episodes.bytes);
+        archive("progress.progress_crc", progress.crc);
+        archive("progress.episodes_crc", episodes.crc);
+    }
+};
+
+// Errors: `id`.
+inline void make_folder(const std::string& path, const char* id) {
+    std::error_code problem;
+    std::filesystem::create_directories(path, problem);
+    if (problem) fail(id, "cannot make the folder %s: %s", path.c_str(), problem.message().c_str());
+}
+
+// Keeps other processes out of a folder for as long as it lives; the system releases it however the process ends.
+// Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
+struct FolderLock {
+    FileDescriptor folder;
+    explicit FolderLock(const std::string& path) : folder(::open(path.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC)) {
+        if (folder.fd < 0) fail_file("run.folder", "open the run folder", path);
+        if (::flock(folder.fd, LOCK_EX | LOCK_NB) == 0) return;
+        if (errno == EWOULDBLOCK)
+            fail("run.busy", "another process is training in %s; wait for it, or choose another folder with --out",
+                 path.c_str());
+        std::fprintf(stderr, "wodtem: %s cannot be locked (%s); make sure that no other process works in it\n",
+                     path.c_str(), std::strerror(errno));
+    }
+};
+
+// A folder may be new, hold this very run, or hold another run, which is then left as it is.
+// Errors: run.folder, run.other_settings.
+inline void claim_folder(const RunFolder& folder, const Settings& settings) {
+    const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors");
+    if (!folder.has("settings") && has_run)
+        fail("run.folder", "%s holds a run without its settings file; choose another folder with --out",
+             folder.path.c_str());
+    const std::string path = folder.file("settings");
+    if (folder.has("settings") && (has_run || folder.has("finished")))
+        require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
+    else
+        write_file_atomic(path, settings_text(settings));  // a start that failed may have left other settings
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The checkpoint. visit(archive) calls archive(name, field) for everything that is state.
+
+inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";
+
+// The logs reach the disk first: the checkpoint notes how long they are.
+template <class Visit>
+void save_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+    folder.sync_logs();
+    TensorFile file;
+    file.metadata["format"] = checkpoint_format;
+    file.metadata["settings"] = settings_text(settings);
+    Saver saver{file};
+    folder.visit(saver);
+    visit(saver);
+    write_safetensors(folder.file("checkpoint.safetensors"), file);
+}
+
+// Reads the state alone. Errors name the file: checkpoint.format, run.other_settings, and those of the visited state.
+template <class Visit>
+void load_state(RunFolder& folder, const Settings& settings, Visit&& visit) {
+    const std::string path = folder.file("checkpoint.safetensors");
+    try {
+        const TensorFile file = read_safetensors(path);
+        if (file.text("format") != checkpoint_format)
+            fail("checkpoint.format", "it is no checkpoint of `wodtem train`");
+        require_same_settings(settings_from_text(file.text("settings"), path), settings, path);
+        Loader loader{file};
+        folder.visit(loader);
+        visit(loader);
+    } catch (const Error& error) {
+        fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
+    }
+}
+
+// Reads the state and cuts the logs back to where they were; if one of them does not fit, neither is touched.
+template <class Visit>
+void load_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+    load_state(folder, settings, visit);
+    folder.progress.check();
+    folder.episodes.check();
+    truncate_file(folder.progress.path, folder.progress.bytes);
+    truncate_file(folder.episodes.path, folder.episodes.bytes);
+}
+
+// Decides when a checkpoint is due: every so many seconds, but so that saving takes at most a twentieth of the time.
+struct CheckpointTimer {
+    double every;  // seconds; 0: always due
+    Clock::time_point saved = Clock::now();
+    double save_seconds = 0;  // of the latest one
+
+    bool due() const { return every == 0 || seconds_since(saved) >= std::max(every, 20 * save_seconds); }
+    template <class Save>
+    void time(Save&& save) {
+        const Clock::time_point begin = Clock::now();
+        save();
+        save_seconds = seconds_since(begin);
+        saved = Clock::now();
+    }
+};
+
+inline void remove_checkpoint(const RunFolder& folder) {
+    for (const char* name : {"checkpoint.safetensors", "checkpoint.safetensors.tmp"})
+        std::filesystem::remove(folder.file(name));
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What the figures need.
+
+// policy.csv: the learned probability of each move in each cell. probabilities [36][8].
+inline void save_policy(const RunFolder& folder, const std::vector<std::vector<float>>& probabilities) {
+    std::string text = "row,column";
+    for (const GridMove& move : grid_move_table) text += std::string(",") + move.name;
+    text += "\n";
+    for (int cell = 0; cell < grid_cells; ++cell) {
+        std::vector<std::string> fields = {std::to_string(cell / grid_size), std::to_string(cell % grid_size)};
+        for (const float p : probabilities[cell]) fields.push_back(number_text(p));
+        text += csv_line(fields);
+    }
+    write_file_atomic(folder.file("policy.csv"), text);
+}
+
+// The share of each move among those made at S; [8].
+inline std::vector<double> moves_at_start(const std::vector<Trajectory>& trajectories, GridWorld world) {
+    std::vector<float> start(world.spec().state_dim);
+    world.cell = grid_start;
+    world.observe(start.data());
+    std::vector<double> shares(grid_moves);
+    double visits = 0;
+    for (const Trajectory& trajectory : trajectories) {
+        for (size_t t = 0; t < trajectory.actions.size(); ++t) {
+            const float* state = &trajectory.states[t * start.size()];
+            if (!std::equal(start.begin(), start.end(), state)) continue;
+            shares[static_cast<size_t>(trajectory.actions[t])] += 1;
+            visits += 1;
+        }
+    }
+    for (double& share : shares) share /= std::max(1.0, visits);
+    return shares;
+}
+
+// start_actions.csv: shares of the moves made at S by the policy, in the data set and in D_online; [8] each, `online`
+// empty for a run without an online phase.
+inline void save_start_actions(const RunFolder& folder, const std::vector<float>& learned,
+                               const std::vector<double>& offline, const std::vector<double>& online) {
+    std::string text = "move,learned,offline,online\n";
+    for (int move = 0; move < grid_moves; ++move)
+        text += csv_line({grid_move_table[move].name, number_text(learned[move]), number_text(offline[move]),
+                          online.empty() ? "nan" : number_text(online[move])});
+    write_file_atomic(folder.file("start_actions.csv"), text);
+}
+
+// paths.csv: the positions of an evaluation's episodes in a maze, the last state included. goals [episodes].
+inline void save_paths(const RunFolder& folder, const std::vector<Episode>& episodes,
+                       const std::vector<std::array<double, 2>>& goals) {
+    std::string text = "episode,step,goal_x,goal_y,x,y\n";
+    size_t number = 0;
+    for (size_t i = 0; i < episodes.size(); ++i) {
+        const Episode& episode = episodes[i];
+        if (!episode.error.empty()) continue;
+        const size_t length = episode.trajectory.rewards.size(), state_dim = episode.state.size();
+        for (size_t t = 0; t <= length; ++t) {
+            const float* state = t < length ? &episode.trajectory.states[t * state_dim] : episode.state.data();
+            text += csv_line({std::to_string(number), std::to_string(t), number_text(goals[i][0]),
+                              number_text(goals[i][1]), number_text(state[0]), number_text(state[1])});
+        }
+        ++number;
+    }
+    write_file_atomic(folder.file("paths.csv"), text);
+}

@@ -1,0 +1,604 @@
+// settings.hpp: every number and word that decides a run, each with its source, and their text form.
+//
+// `setting_rows` is the table of settings: name, range, and the source of the grid world's value (WODTEM Table I);
+// `task_rows` is what the D4RL tasks change (WODTEM Table II, sec. V-C, ODT's code); `small_rows` is preset small.
+// A run folder's file `settings` and a model's metadata hold the text form, one line a setting:
+//
+//   name = value                            # source
+//
+// Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
+// an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
+#pragma once
+
+#include <algorithm>
+#include <charconv>
+#include <cmath>
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <optional>
+#include <set>
+#include <span>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <variant>
+#include <vector>
+
+#include "../gridworld.hpp"
+#include "../mujoco_env.hpp"
+#include "../nn.hpp"
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Text.
+
+// The parts of a text between separators; "" is one empty part.
+inline std::vector<std::string> split(const std::string& text, char separator) {
+    std::vector<std::string> parts(1);
+    for (const char c : text) {
+        if (c == separator)
+            parts.emplace_back();
+        else
+            parts.back() += c;
+    }
+    return parts;
+}
+
+inline std::string trimmed(std::string_view text) {
+    const size_t first = text.find_first_not_of(" \t");
+    if (first == std::string_view::npos) return "";
+    return std::string(text.substr(first, text.find_last_not_of(" \t") + 1 - first));
+}
+
+// The shortest text that reads back as the same number; Number is float or double.
+template <class Number>
+std::string number_text(Number x) {
+    char text[32];
+    return {text, std::to_chars(text, text + sizeof text, x).ptr};
+}
+
+// A finite number that takes up the whole text, or nothing.
+inline std::optional<double> to_number(const std::string& text) {
+    double x = 0;
+    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), x);
+    if (error != std::errc() || end != text.data() + text.size() || !std::isfinite(x)) return std::nullopt;
+    return x;
+}
+
+// Levenshtein distance: the number of letters to insert, remove or replace.
+inline int edit_distance(const std::string& a, const std::string& b) {
+    std::vector<int> row(b.size() + 1);  // of the prefix of a, to each prefix of b
+    for (size_t j = 0; j <= b.size(); ++j) row[j] = static_cast<int>(j);
+    for (size_t i = 1; i <= a.size(); ++i) {
+        int diagonal = row[0]++;
+        for (size_t j = 1; j <= b.size(); ++j) {
+            const int replaced = diagonal + (a[i - 1] != b[j - 1]);
+            diagonal = row[j];
+            row[j] = std::min({row[j] + 1, row[j - 1] + 1, replaced});
+        }
+    }
+    return row[b.size()];
+}
+
+// The name with the least edit distance; of several, the first.
+inline std::string nearest_name(const std::string& name, const std::vector<std::string>& names) {
+    return *std::min_element(names.begin(), names.end(), [&](const std::string& a, const std::string& b) {
+        return edit_distance(name, a) < edit_distance(name, b);
+    });
+}
+
+// The index of `name` among an enumeration's names, which hold it.
+template <size_t N>
+int index_of(const std::array<const char*, N>& names, const std::string& name) {
+    return static_cast<int>(std::find(names.begin(), names.end(), name) - names.begin());
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The tables.
+
+// The initial values are those of the paper's grid world.
+struct Settings {
+    std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
+    std::string physics = "none", mujoco = "none", dataset = "none", dataset_sha256 = "none", first_weights = "none";
+    int64_t seed = 0;
+
+    int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
+    bool position = false;
+    double dropout = 0.1;
+
+    std::string optimizer = "lamb";
+    double learning_rate = 1e-3, weight_decay = 0, clip_norm = 0.25;
+    bool lamb_always_adapt = false;
+    int64_t warmup_updates = 10000, batch_size = 256, offline_updates = 1000, updates_per_iteration = 50;
+
+    double initial_lambda = 0.1, lambda_learning_rate = 1e-4, eta = -1;
+
+    int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
+    double g_online = 2, g_eval = 1, reward_scale = 1;
+    bool keep_lowest = false;
+
+    double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
+    int64_t K = 1, projected_dim = 0, table_size = 36;
+    std::string keys = "raw", eviction = "lfu";
+    bool exclude_self = false;
+
+    std::string behaviour = "right_down", edge = "clipped", state_encoding = "coordinates";
+    int64_t data_trajectories = 500, data_seed = default_data_seed;
+
+    std::map<std::string, std::string> source;  // name -> source, of values that differ from `setting_rows`
+    std::string dataset_path, weights_path;     // not settings: a run may continue on another machine
+};
+
+using Field = std::variant<bool Settings::*, int64_t Settings::*, double Settings::*, std::string Settings::*>;
+
+struct SettingRow {
+    const char* name;
+    Field field;
+    double low, high;     // of numbers, inclusive
+    const char* choices;  // of words, separated by |
+    const char* source;   // of the grid world's value
+};
+
+constexpr const char* task_names =
+    "gridworld|hopper-medium-v2|hopper-medium-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|"
+    "halfcheetah-medium-v2|halfcheetah-medium-replay-v2|ant-medium-v2|ant-medium-replay-v2|antmaze-umaze-v2|"
+    "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|walker2d-v2|halfcheetah-v2|"
+    "ant-v2";
+constexpr double many = 1e9;
+// WODTEM Table I: each row is the source of a value below.
+inline const SettingRow setting_rows[] = {
+    {"task", &Settings::task, 0, 0, task_names, "command line"},
+    {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
+    {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
+    {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
+    {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain", "the kernel: multiply-add with one rounding or two"},
+    {"physics", &Settings::physics, 0, 0, "none|d4rl|2.2", "the task has no bodies"},
+    {"mujoco", &Settings::mujoco, 0, 0, "", "the library's version"},
+    {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
+    {"dataset_sha256", &Settings::dataset_sha256, 0, 0, "", "of the file"},
+    {"first_weights", &Settings::first_weights, 0, 0, "", "none: drawn from the seed"},
+    // The network.
+    {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
+    {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
+    {"width", &Settings::width, 8, 65536, "", "WODTEM Table I: embedding dimension"},
+    {"context_length", &Settings::context_length, 1, 1000, "", "WODTEM Table I: context length C"},
+    {"eval_context", &Settings::eval_context, 1, 1000, "", "ODT's code; never more than context_length"},
+    {"position", &Settings::position, 0, 0, "", "WODTEM Table I: position"},
+    {"dropout", &Settings::dropout, 0, 0.99, "", "ODT's code"},
+    // Optimisation of theta.
+    {"optimizer", &Settings::optimizer, 0, 0, "lamb|adamw", "ODT's code: LAMB, which is Adam at weight decay 0"},
+    {"learning_rate", &Settings::learning_rate, 0, 1, "", "WODTEM Table I: learning rate"},
+    {"weight_decay", &Settings::weight_decay, 0, 1, "", "WODTEM Table I: weight decay"},
+    {"clip_norm", &Settings::clip_norm, 0, many, "", "ODT's code; 0: none"},
+    {"lamb_always_adapt", &Settings::lamb_always_adapt, 0, 0, "", "ODT's code: no trust ratio at weight decay 0"},
+    {"warmup_updates", &Settings::warmup_updates, 0, many, "", "ODT's code: one schedule for both phases"},
+    {"batch_size", &Settings::batch_size, 1, 1e6, "", "ODT's code: windows of each update"},
+    {"offline_updates", &Settings::offline_updates, 0, many, "", "WODTEM Table I: offline training updates"},
+    {"updates_per_iteration", &Settings::updates_per_iteration, 0, many, "",
+     "WODTEM Table I: online training updates per iteration"},
+    // Optimisation of lambda.
+    {"initial_lambda", &Settings::initial_lambda, 1e-9, 1e3, "", "ODT's code"},
+    {"lambda_learning_rate", &Settings::lambda_learning_rate, 0, 1, "", "ODT's code: Adam on log lambda"},
+    {"eta", &Settings::eta, -many, many, "",
+     "chosen: minus the number of action dimensions, as ODT's; paper: a constant"},
+    // Data and interaction.
+    {"online_steps", &Settings::online_steps, 0, many, "", "WODTEM sec. V-D: 20K; 0: offline only"},
+    {"buffer_size", &Settings::buffer_size, 1, 1e6, "", "WODTEM Table I: buffer size, trajectories"},
+    {"eval_episodes", &Settings::eval_episodes, 1, 1e6, "", "ODT's code: 10; all would be one here: nothing is random"},
+    {"eval_every", &Settings::eval_every, 1, 1e6, "", "ODT's code: online iterations (episodes) from one to the next"},
+    {"g_online", &Settings::g_online, -many, many, "", "WODTEM Table I: g_online"},
+    {"g_eval", &Settings::g_eval, -many, many, "", "WODTEM Table I: g_eval"},
+    {"reward_scale", &Settings::reward_scale, 1e-9, 1e9, "", "chosen: ODT's 0.001 would leave no signal"},
+    {"keep_lowest", &Settings::keep_lowest, 0, 0, "", "ODT's code: drops the lowest-return offline trajectory"},
+    // Episodic memory.
+    {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
+    {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},
+    {"epsilon", &Settings::epsilon, 0, many, "", "WODTEM sec. V-D: bound on the squared distance"},
+    {"tau", &Settings::tau, 1e-9, 1e9, "", "chosen: eq. (6) has none, which is 1"},
+    {"K", &Settings::K, 1, 1000, "", "WODTEM sec. V-D: neighbours"},
+    {"projected_dim", &Settings::projected_dim, 0, 64, "", "WODTEM sec. V-D: F1; 0: no projection"},
+    {"table_size", &Settings::table_size, 1, 1e8, "", "WODTEM sec. V-D: entries"},
+    {"keys", &Settings::keys, 0, 0, "raw|normalized", "chosen: WODTEM sec. IV-B.1 indexes by states"},
+    {"eviction", &Settings::eviction, 0, 0, "lfu|lru", "WODTEM sec. IV-B.1: least frequently accessed"},
+    {"exclude_self", &Settings::exclude_self, 0, 0, "",
+     "WODTEM sec. IV-B.2: no exception is made for the state itself"},
+    // The grid world.
+    {"behaviour", &Settings::behaviour, 0, 0, "right_down|left_down|random|recorded",
+     "chosen: the paper's statistics rule out its words"},
+    {"edge", &Settings::edge, 0, 0, "clipped|stays|wraps|excluded", "chosen: fits the paper's statistics"},
+    {"state_encoding", &Settings::state_encoding, 0, 0, "coordinates|one_hot", "chosen: (row, column)"},
+    {"data_trajectories", &Settings::data_trajectories, 1, 1e6, "", "WODTEM sec. IV-A"},
+    {"data_seed", &Settings::data_seed, 0, 4294967295, "",
+     "chosen: gives mean length 47.50 and return 0.91, sec. IV-A"},
+};
+
+// What the D4RL tasks change; later rows override earlier ones. A row holds for tasks whose name begins with `task` and
+// for `method`; "" stands for all. ODT's paper prints no such table: values marked "unverified" have no source, values
+// marked "one public reproduction" a single one.
+struct TaskRow {
+    const char *task, *method, *name, *value, *source;
+};
+// WODTEM Table II: each row likewise.
+inline const TaskRow task_rows[] = {
+    {"", "", "layers", "4", "ODT's code"},
+    {"", "", "heads", "4", "ODT's code"},
+    {"", "", "width", "512", "ODT's code"},
+    {"", "", "context_length", "20", "ODT's code"},
+    {"", "", "updates_per_iteration", "300", "ODT's code"},
+    {"", "", "buffer_size", "1000", "ODT's code"},
+    {"", "", "eval_episodes", "10", "ODT's code"},
+    {"", "", "reward_scale", "0.001", "ODT's code"},
+    {"", "", "learning_rate", "1e-4", "ODT's code"},
+    {"", "", "weight_decay", "5e-4", "ODT's code"},
+    {"", "", "offline_updates", "5000", "ODT's code"},
+    {"", "", "position", "no", "ODT's code"},
+    {"", "", "gamma", "0.99", "WODTEM sec. V-C"},
+    {"", "", "epsilon", "0.1", "WODTEM sec. V-C"},
+    {"", "", "online_steps", "200000", "WODTEM sec. V-C"},
+    {"", "", "projected_dim", "4", "WODTEM sec. V-C"},
+    {"", "", "table_size", "2e6", "WODTEM sec. V-C"},
+    {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
+    {"", "", "K", "2", "WODTEM sec. V-C"},
+    {"", "", "physics", "d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
+    {"", "", "behaviour", "recorded", "the data set"},
+    {"", "", "data_trajectories", "10", "chosen, of random actions: enough to normalise states by"},
+    {"", "", "data_seed", "0", "chosen"},
+    {"hopper", "", "g_eval", "3600", "ODT's code"},
+    {"hopper", "", "g_online", "7200", "ODT's code"},
+    {"hopper", "", "eta", "-3", "ODT's code: minus the action dimensions"},
+    {"hopper-medium-replay", "", "learning_rate", "2e-3", "one public reproduction of ODT"},
+    {"hopper-medium-replay", "", "weight_decay", "1e-4", "one public reproduction of ODT"},
+    {"walker2d", "", "learning_rate", "1e-3", "public reproductions of ODT agree"},
+    {"walker2d", "", "weight_decay", "1e-3", "public reproductions of ODT agree"},
+    {"walker2d", "", "offline_updates", "10000", "public reproductions of ODT agree"},
+    {"walker2d", "", "g_eval", "5000", "public reproductions of ODT agree"},
+    {"walker2d", "", "g_online", "10000", "public reproductions of ODT agree"},
+    {"walker2d", "", "eta", "-6", "ODT's code: minus the action dimensions"},
+    {"walker2d", "", "epsilon", "0.2", "WODTEM sec. V-C"},
+    {"halfcheetah", "", "g_eval", "6000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "g_online", "12000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "eta", "-6", "ODT's code: minus the action dimensions"},
+    {"halfcheetah", "", "epsilon", "0.6", "WODTEM sec. V-C"},
+    {"ant-", "", "g_eval", "6000", "unverified"},
+    {"ant-", "", "g_online", "12000", "unverified"},
+    {"ant", "", "eta", "-8", "ODT's code: minus the action dimensions"},
+    {"ant", "", "epsilon", "0.3", "WODTEM sec. V-C"},
+    {"antmaze", "", "width", "1024", "one public reproduction of ODT"},
+    {"antmaze", "", "learning_rate", "1e-3", "one public reproduction of ODT"},
+    {"antmaze", "", "weight_decay", "0", "one public reproduction of ODT"},
+    {"antmaze", "", "offline_updates", "7000", "one public reproduction of ODT"},
+    {"antmaze", "", "buffer_size", "1500", "one public reproduction of ODT"},
+    {"antmaze", "", "position", "yes", "one public reproduction of ODT"},
+    {"antmaze", "", "g_eval", "1", "one public reproduction of ODT"},
+    {"antmaze", "", "g_online", "2", "one public reproduction of ODT"},
+    {"antmaze", "", "reward_scale", "1", "ODT's code"},
+    {"maze2d", "", "layers", "4", "WODTEM Table II: number of layers"},
+    {"maze2d", "", "heads", "4", "WODTEM Table II: number of attention heads"},
+    {"maze2d", "", "width", "512", "WODTEM Table II: embedding dimension"},
+    {"maze2d", "", "context_length", "20", "WODTEM Table II: context length"},
+    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II: learning rate"},
+    {"maze2d", "", "weight_decay", "0", "WODTEM Table II: weight decay"},
+    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II: offline training updates"},
+    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II: online training updates per iteration"},
+    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II: buffer size"},
+    {"maze2d", "", "position", "yes", "WODTEM Table II: position"},
+    {"maze2d", "", "eta", "-2", "ODT's code: minus the action dimensions"},
+    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II: g_online"},
+    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II: g_eval"},
+    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II: g_online"},
+    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II: g_eval"},
+    {"maze2d-large", "", "g_online", "560", "WODTEM Table II: g_online"},
+    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II: g_eval"},
+    {"maze2d-large", "", "table_size", "4e6", "WODTEM sec. V-C"},
+    {"", "dt", "layers", "3", "DT's code"},
+    {"", "dt", "heads", "1", "DT's code"},
+    {"", "dt", "width", "128", "DT's code"},
+    {"", "dt", "eval_context", "20", "DT's code"},
+    {"", "dt", "batch_size", "64", "DT's code"},
+    {"", "dt", "optimizer", "adamw", "DT's code"},
+    {"", "dt", "learning_rate", "1e-4", "DT's code"},
+    {"", "dt", "weight_decay", "1e-4", "DT's code"},
+    {"", "dt", "offline_updates", "100000", "DT's code"},
+    {"", "dt", "position", "yes", "DT's code"},
+    {"maze2d", "dt", "reward_scale", "1", "chosen: as others' DT on maze2d"},
+};
+
+// Preset small: what it changes of preset paper, so that a run takes half an hour on two cores. All three methods share
+// one network and one schedule, so that only the objective differs.
+inline const TaskRow small_rows[] = {
+    {"", "", "layers", "2", "preset small"},
+    {"", "", "heads", "2", "preset small"},
+    {"", "", "width", "64", "preset small"},
+    {"", "", "context_length", "1", "preset small: states tell all; more windows instead of longer ones"},
+    {"", "", "batch_size", "256", "preset small: ODT's"},
+    {"", "", "position", "no",
+     "preset small: maze2d's data end after 230 steps; later rows of the table would not learn"},
+    {"", "", "learning_rate", "1e-3", "preset small: a narrow network and few updates"},
+    {"", "", "warmup_updates", "1000", "preset small: a tenth of ODT's"},
+    {"", "", "offline_updates", "6000", "preset small"},
+    {"", "dt", "offline_updates", "12700", "preset small: as many as the others make, where episodes have 300 steps"},
+    {"", "", "updates_per_iteration", "100", "preset small"},
+    {"", "", "online_steps", "20000", "preset small: a tenth of WODTEM's"},
+    {"maze2d", "", "reward_scale", "1", "preset small: at ODT's 0.001 returns-to-go, at most 0.055, are not heeded"},
+    {"maze2d", "", "buffer_size", "4000", "preset small: the best 1500 trajectories all leave the goal"},
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Reading and changing settings by name.
+
+// Errors: usage.setting names the nearest setting.
+inline const SettingRow& setting_row(const std::string& name) {
+    std::vector<std::string> names;
+    for (const SettingRow& row : setting_rows) {
+        if (name == row.name) return row;
+        names.push_back(row.name);
+    }
+    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(),
+         nearest_name(name, names).c_str());
+}
+
+inline std::string setting_text(const Settings& settings, const SettingRow& row) {
+    const auto text = [&](auto field) -> std::string {
+        const auto& value = settings.*field;
+        using Value = std::decay_t<decltype(value)>;
+        if constexpr (std::is_same_v<Value, bool>) return value ? "yes" : "no";
+        if constexpr (std::is_same_v<Value, int64_t>) return std::to_string(value);
+        if constexpr (std::is_same_v<Value, double>) return number_text(value);
+        if constexpr (std::is_same_v<Value, std::string>) return value;
+    };
+    return std::visit(text, row.field);
+}
+
+inline std::string parse_choice(const SettingRow& row, const std::string& text) {
+    const std::vector<std::string> choices = split(row.choices, '|');
+    if (*row.choices != 0 && std::find(choices.begin(), choices.end(), text) == choices.end())
+        fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
+             row.choices, nearest_name(text, choices).c_str());
+    return text;
+}
+
+inline bool parse_flag(const SettingRow& row, const std::string& text) {
+    if (text != "yes" && text != "no")
+        fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
+    return text == "yes";
+}
+
+inline double parse_number(const SettingRow& row, const std::string& text, bool whole) {
+    const std::optional<double> x = to_number(text);
+    if (x && *x >= row.low && *x <= row.high && (!whole || *x == std::floor(*x))) return *x;
+    const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
+    fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
+         text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
+         number_text(whole ? std::round(nearest) : nearest).c_str());
+}
+
+// Errors: usage.setting with what is allowed.
+inline void set_setting(Settings& settings, const std::string& name, const std::string& text) {
+    const SettingRow& row = setting_row(name);
+    if (const auto* word = std::get_if<std::string Settings::*>(&row.field))
+        settings.*(*word) = parse_choice(row, text);
+    if (const auto* flag = std::get_if<bool Settings::*>(&row.field)) settings.*(*flag) = parse_flag(row, text);
+    if (const auto* real = std::get_if<double Settings::*>(&row.field))
+        settings.*(*real) = parse_number(row, text, false);
+    if (const auto* integer = std::get_if<int64_t Settings::*>(&row.field))
+        settings.*(*integer) = static_cast<int64_t>(parse_number(row, text, true));
+}
+
+// `source`: the command line, the preset, the method or a row of `task_rows`.
+inline void set_from(Settings& settings, const std::string& name, const std::string& text, const std::string& source) {
+    set_setting(settings, name, text);
+    settings.source[name] = source;
+}
+
+// The full id of a task whose version may have been left off: hopper-medium is hopper-medium-v2.
+inline std::string full_task_name(const std::string& name) {
+    for (const std::string& task : split(task_names, '|'))
+        if (task.starts_with(name + "-v") && task.size() == name.size() + 3) return task;
+    return name;
+}
+
+// Errors: usage.setting for an unknown task, method or preset.
+inline Settings default_settings(const std::string& task, const std::string& method, const std::string& preset) {
+    Settings settings;
+    set_setting(settings, "task", full_task_name(task));
+    set_setting(settings, "method", method);
+    set_setting(settings, "preset", preset);
+    const bool gridworld = settings.task == "gridworld";
+    const auto apply = [&](std::span<const TaskRow> rows) {
+        for (const TaskRow& row : rows)
+            if (!gridworld && settings.task.starts_with(row.task) && (*row.method == 0 || method == row.method))
+                set_from(settings, row.name, row.value, row.source);
+    };
+    apply(task_rows);
+    if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
+    if (preset == "small") apply(small_rows);
+    if (method == "dt") {
+        set_from(settings, "online_steps", "0", "DT learns offline only");
+        for (const char* name : {"layers", "heads", "width", "context_length", "learning_rate", "weight_decay",
+                                 "offline_updates", "position"})
+            if (gridworld && !settings.source.contains(name))
+                settings.source[name] = "chosen for DT: as ODT's in Table I, so that only the objective differs";
+    }
+    return settings;
+}
+
+// Conditions on several settings at once. Errors: usage.setting.
+inline void check_together(const Settings& settings) {
+    const long long width = settings.width, heads = settings.heads;
+    if (width % heads != 0)
+        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", width, heads,
+             (width / heads + 1) * heads);
+    if (settings.batch_size * settings.context_length > 1000000)
+        fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
+             static_cast<long long>(settings.batch_size), static_cast<long long>(settings.context_length));
+    if (settings.online_steps > 0 && settings.method == "dt")
+        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
+             static_cast<long long>(settings.online_steps));
+    const bool gridworld = settings.task == "gridworld";
+    if (gridworld != (settings.physics == "none"))
+        fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
+             gridworld ? "a table of moves: none" : "d4rl or 2.2");
+    if (gridworld == (settings.behaviour == "random" || settings.behaviour == "recorded"))
+        fail("usage.setting", "%s cannot have behaviour %s; it is %s", settings.task.c_str(),
+             settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "recorded or random");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The text form.
+
+inline std::string settings_text(const Settings& settings) {
+    std::string text;
+    for (const SettingRow& row : setting_rows) {
+        const auto source = settings.source.find(row.name);
+        std::string line = std::string(row.name) + " = " + setting_text(settings, row);
+        line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
+        text += line + "# " + (source == settings.source.end() ? row.source : source->second) + "\n";
+    }
+    return text;
+}
+
+struct Setting {
+    std::string name, value;
+    std::string source;  // "command line": a command that repeats the run must give the setting again
+};
+
+// The lines of a text form, before they are checked against the table. Blank lines and lines that begin with # are
+// skipped; the first " = " of a line ends the name, the first " # " after it ends the value. Errors: settings.line,
+// settings.repeated.
+inline std::vector<Setting> parse_settings(std::string_view text, const std::string& path) {
+    std::vector<Setting> out;
+    for (size_t line = 1; !text.empty(); ++line) {
+        const std::string_view all = text.substr(0, text.find('\n'));
+        text.remove_prefix(std::min(text.size(), all.size() + 1));
+        if (trimmed(all).empty() || trimmed(all)[0] == '#') continue;
+        const size_t equals = all.find(" = "), hash = all.find(" # ", equals);  // npos stays npos
+        Setting setting;
+        if (hash != std::string_view::npos)
+            setting = {trimmed(all.substr(0, equals)), trimmed(all.substr(equals + 2, hash - equals - 2)),
+                       trimmed(all.substr(hash + 2))};
+        if (setting.name.empty() || setting.value.empty() || setting.source.empty())
+            fail("settings.line", "%s: line %zu: expected \"name = value    # source\", got \"%s\"", path.c_str(), line,
+                 trimmed(all).c_str());
+        if (std::any_of(out.begin(), out.end(), [&](const Setting& other) { return other.name == setting.name; }))
+            fail("settings.repeated", "%s: line %zu: \"%s\" was set before; keep one of the lines", path.c_str(), line,
+                 setting.name.c_str());
+        out.push_back(setting);
+    }
+    return out;
+}
+
+// `path` is named in errors: settings.value, settings.missing, and those of parse_settings().
+inline Settings settings_from_text(const std::string& text, const std::string& path) {
+    Settings settings;
+    std::set<std::string> found;
+    for (const auto& [name, value, source] : parse_settings(text, path)) {
+        try {
+            set_from(settings, name, value, source);
+        } catch (const Error& error) {
+            fail("settings.value", "%s: %s; is it damaged, or from another version?", path.c_str(), error.what());
+        }
+        found.insert(name);
+    }
+    for (const SettingRow& row : setting_rows)
+        if (!found.contains(row.name))
+            fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
+                 row.name);
+    return settings;
+}
+
+// `where`: the file or folder that `found` was read from. Errors: run.other_settings.
+inline void require_same_settings(const Settings& found, const Settings& wanted, const std::string& where) {
+    for (const SettingRow& row : setting_rows) {
+        const std::string was = setting_text(found, row), now = setting_text(wanted, row);
+        if (was == now) continue;
+        const bool kernel = std::string(row.name) == "arithmetic";
+        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
+             row.name, was.c_str(), now.c_str(),
+             kernel ? "choose the kernel it was begun with (--kernel)"
+                    : "choose another folder with --out, or the same settings");
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// From settings to the parts they configure.
+
+inline TransformerConfig transformer_config(const Settings& settings, const EnvironmentSpec& spec) {
+    const bool discrete = spec.discrete_actions > 0;
+    TransformerConfig config;
+    config.state_dim = spec.state_dim;
+    config.action_dim = discrete ? spec.discrete_actions : spec.action_dim;  // a discrete action is a one-hot vector
+    config.layers = static_cast<int>(settings.layers);
+    config.heads = static_cast<int>(settings.heads);
+    config.width = static_cast<int>(settings.width);
+    config.max_timesteps = settings.position ? 1000 : 0;  // ODT's code: a table of 1000 rows
+    config.dropout = static_cast<float>(settings.dropout);
+    config.head = discrete                  ? Head::categorical
+                  : settings.method == "dt" ? Head::deterministic
+                                            : Head::squashed_gaussian;
+    return config;
+}
+
+inline OptimizerConfig optimizer_config(const Settings& settings) {
+    OptimizerConfig config;
+    config.rule = settings.optimizer == "lamb" ? OptimizerConfig::Rule::lamb : OptimizerConfig::Rule::adamw;
+    config.learning_rate = settings.learning_rate;
+    config.weight_decay = settings.weight_decay;
+    config.always_adapt = settings.lamb_always_adapt;
+    config.clip_norm = settings.clip_norm;
+    config.warmup_updates = static_cast<uint64_t>(settings.warmup_updates);
+    return config;
+}
+
+inline MemoryConfig memory_config(const Settings& settings, const EnvironmentSpec& spec) {
+    MemoryConfig config{};
+    config.state_dim = spec.state_dim;
+    config.action_dim = spec.action_dim;
+    config.projected_dim = static_cast<int>(settings.projected_dim);
+    config.capacity = static_cast<size_t>(settings.table_size);
+    config.K = static_cast<int>(settings.K);
+    config.epsilon = settings.epsilon;
+    config.tau = settings.tau;
+    config.exclude_self = settings.exclude_self;
+    config.eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru;
+    return config;
+}
+
+inline GridWorld make_grid_world(const Settings& settings) {
+    GridWorld world;
+    world.edge = static_cast<EdgeRule>(index_of(edge_rule_names, settings.edge));
+    world.encoding = static_cast<StateEncoding>(index_of(state_encoding_names, settings.state_encoding));
+    return world;
+}
+
+// Errors: mujoco.absent in a program that was built without the library.
+inline std::unique_ptr<Environment> make_environment(const Settings& settings) {
+    if (settings.task == "gridworld") return make_grid_world(settings).clone();
+#ifdef WODTEM_MUJOCO
+    const int physics = index_of(physics_names, settings.physics);
+    return std::make_unique<MujocoEnvironment>(*find_mujoco_task(settings.task), static_cast<Physics>(physics));
+#else
+    fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s",
+         settings.task.c_str(), mujoco_advice);
+#endif
+}
+
+inline EnvironmentSpec spec_of(const Settings& settings) {
+    if (settings.task == "gridworld") return make_grid_world(settings).spec();
+    const MujocoTask& task = *find_mujoco_task(settings.task);
+    return {task.state_dim, task.action_dim, 0, task.max_episode_steps};
+}
+
+// The score of a return: D4RL's normalised score, and on the grid world the return itself.
+inline double score_of(const Settings& settings, double total_return) {
+    const MujocoTask* task = find_mujoco_task(settings.task);
+    return task ? normalised_score(*task, total_return) : total_return;
+}
+
+// How many updates a run will make: exact for the offline phase; in the online phase episodes are taken to use up the
+// time limit, and on the grid world to be as many as preset small's runs had on average (data/RESULTS.md).
+inline double expected_updates(const Settings& settings) {
+    double episodes = static_cast<double>(settings.online_steps) / spec_of(settings).max_episode_steps;
+    if (settings.task == "gridworld" && settings.online_steps > 0) episodes = settings.method == "odt" ? 498 : 2041;
+    return static_cast<double>(settings.offline_updates) +
+           episodes * static_cast<double>(settings.updates_per_iteration);
+}
