@@ -1,12 +1,12 @@
 # WODTEM: a reference implementation in one binary. Needs g++ (12 or newer) and, for all tasks but the grid world, MuJoCo
 # 2.2; both are installed with apt where they are missing. Without MuJoCo the grid world still builds.
 #
-#   make run              build, run DT, ODT and WODTEM on the grid world (preset small, about a minute), show the report
+#   make run              build, train DT, ODT and WODTEM on the grid world (one to two minutes), show the report
 #   make test             build and run every test; the last line is "N passed, N failed"
 #   make                  build ./wodtem alone
 #   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
-#   make map              the map from the paper's equations to code, tests and vectors, as README.md holds it
+#   make map              the map from the paper's equations to code, tests and vectors
 #   make mutants          which of some 200 one-line mistakes the golden vectors and the tests find; about 15 minutes
 #   make bench            the machine's peak, each kernel's share of it, update and look-up times
 #   make format           lay out the sources with clang-format
