@@ -738,29 +738,8 @@ ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tensors and the tape. Templated on the scalar: float trains, double serves the checks against finite differences.
 
-// Two-dimensional, row-major. `gradient` is null where no gradient is wanted (inputs, acting).
 template <class T>
-struct Tensor {
-    T* value = nullptr;     // [rows, columns]
-    T* gradient = nullptr;  // [rows, columns], accumulated
-    int rows = 0, columns = 0;
-    bool* untouched = nullptr;  // true until the first addition to the gradient, which is not initialised until then
-    size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
-};
-
-// How the caller must store its contribution to x's gradient: the first one overwrites all of it, which saves a pass of
-// zeros. To be called once per contribution.
-template <class T>
-Store next_store(Tensor<T> x) {
-    return x.untouched && std::exchange(*x.untouched, false) ? Store::overwrite : Store::accumulate;
-}
-
-// x's gradient, to be added to: zeros before the first contribution.
-template <class T>
-T* gradient_of(Tensor<T> x) {
-    if (next_store(x) == Store::overwrite) std::fill_n(x.gradient, x.size(), T(0));
-    return x.gradient;
-}
+struct Tape;
 
 // Memory that is handed out in pieces and taken back all at once; after the first batch of a shape nothing is
 // allocated.
@@ -773,19 +752,16 @@ class Arena {
             ++chunk_;
             used_ = 0;
         }
-        if (chunk_ == chunks_.size()) add_chunk(std::max(bytes, size_t{1} << 20));
+        if (chunk_ == chunks_.size()) add_chunk(std::max({bytes, total_, size_t{1} << 20}));
         used_ += bytes;
         return chunks_[chunk_].lines.get() + (used_ - bytes) / sizeof(Buffer::Line);
     }
     // Takes all pieces back. Several chunks become one, or batches of ever new shapes would each leave theirs behind.
     void reset() {
-        size_t total = 0;
-        for (const Chunk& chunk : chunks_) total += chunk.bytes;
         chunk_ = used_ = 0;
-        if (chunks_.size() > 1) {
-            chunks_.clear();
-            add_chunk(total);
-        }
+        if (chunks_.size() < 2) return;
+        chunks_.clear();
+        add_chunk(std::exchange(total_, 0));
     }
 
   private:
@@ -793,11 +769,32 @@ class Arena {
         std::unique_ptr<Buffer::Line[]> lines;
         size_t bytes;
     };
-    void add_chunk(size_t bytes) {  // `new` without parentheses leaves the memory uninitialised
+    // Each chunk doubles the memory; `new` without parentheses leaves it uninitialised, and what is never used costs none.
+    void add_chunk(size_t bytes) {
+        total_ += bytes;
         chunks_.push_back({std::unique_ptr<Buffer::Line[]>(new Buffer::Line[bytes / sizeof(Buffer::Line)]), bytes});
     }
     std::vector<Chunk> chunks_;
-    size_t chunk_ = 0, used_ = 0;
+    size_t chunk_ = 0, used_ = 0, total_ = 0;
+};
+
+// d(loss)/d(a tensor), accumulated. Its memory is taken at the first addition, which overwrites it and so saves a pass of
+// zeros, and given back after the last backward step that reads it: at any time few gradients are alive.
+template <class T>
+struct Gradient {
+    T* data = nullptr;        // [rows, columns]; null before the first addition
+    Tape<T>* tape = nullptr;  // that gives the memory; null: a parameter's gradient, which always has its own
+    int readers = 0;          // backward steps still to come
+};
+
+// Two-dimensional, row-major. `gradient` is null where no gradient is wanted (inputs, acting).
+template <class T>
+struct Tensor {
+    T* value = nullptr;  // [rows, columns]
+    Gradient<T>* gradient = nullptr;
+    int rows = 0, columns = 0;
+    size_t size() const { return static_cast<size_t>(rows) * static_cast<size_t>(columns); }
+    T* grad() const { return gradient->data; }  // [rows, columns] d(loss)/d(value) so far
 };
 
 // Records each operation's backward step and replays them in reverse. Gradients add up, so a tensor may be used any
@@ -809,20 +806,17 @@ struct Tape {
     size_t part = 0;        // the number of this part of a batch: each part has its own dropout masks
     Random dropout_random{0, Stream::dropout};
     uint64_t dropout_step = 0;  // the update: fresh masks for each
-    // Called with each layer's output as soon as it is computed; may be empty.
+    // Called with each layer's output as soon as it is computed; may be empty. While it is set, gradients stay until
+    // reset(), for the caller to read.
     std::function<void(const std::string& name, const Tensor<T>& output)> watch;
 
     explicit Tape(Compute& c) : compute(c) {}
 
-    // A result [rows, columns], not initialised; its gradient, if recorded, is untouched.
+    // A result [rows, columns], not initialised.
     Tensor<T> make(int rows, int columns) {
         Tensor<T> x = {nullptr, nullptr, rows, columns};
         x.value = scratch<T>(x.size());
-        if (recording) {
-            x.gradient = scratch<T>(x.size());
-            x.untouched = scratch<bool>(1);
-            *x.untouched = true;
-        }
+        if (recording) x.gradient = new (scratch<Gradient<T>>(1)) Gradient<T>{nullptr, this};
         return x;
     }
 
@@ -835,8 +829,7 @@ struct Tape {
     // An input: copied, without gradient.
     template <class Number>
     Tensor<T> constant(const Number* data, int rows, int columns) {
-        Tensor<T> x = {nullptr, nullptr, rows, columns};
-        x.value = scratch<T>(x.size());
+        Tensor<T> x = {scratch<T>(static_cast<size_t>(rows) * columns), nullptr, rows, columns};
         std::copy_n(data, x.size(), x.value);
         return x;
     }
@@ -855,26 +848,42 @@ struct Tape {
         return static_cast<Element*>(arena_.take(count * sizeof(Element)));
     }
 
-    // Keeps `step` for backward(), which runs it if anything has been added to the gradient of its result. It is
-    // copied into the arena, so it may hold views and numbers only.
+    // Keeps `step` for backward(), which runs it if anything has been added to the gradient of its result; without a
+    // result (an empty tensor) it always runs. It is copied into the arena, so it may hold views and numbers only.
     template <class Step>
     void on_backward(Tensor<T> result, Step step) {
         static_assert(std::is_trivially_destructible_v<Step>);
         if (!recording) return;
+        if (result.gradient) result.gradient->readers += 1;
         const auto call = [](void* s) { (*static_cast<Step*>(s))(); };
-        steps_.push_back({call, new (arena_.take(sizeof(Step))) Step(step), result.untouched});
+        steps_.push_back({call, new (arena_.take(sizeof(Step))) Step(step), result});
     }
 
     // d(loss)/d(everything recorded), for a loss [1, 1].
     void backward(Tensor<T> loss) {
         *gradient_of(loss) = 1;
-        for (size_t i = steps_.size(); i-- > 0;)
-            if (!steps_[i].untouched || !*steps_[i].untouched) steps_[i].call(steps_[i].step);
+        for (size_t i = steps_.size(); i-- > 0;) {
+            Gradient<T>* const gradient = steps_[i].result.gradient;
+            if (!gradient || gradient->data) steps_[i].call(steps_[i].step);
+            if (gradient && --gradient->readers == 0 && gradient->data && !watch)
+                unused_.emplace_back(steps_[i].result.size(), std::exchange(gradient->data, nullptr));
+        }
+    }
+
+    // Memory for a gradient of `size` elements, not initialised: one that is no longer read, or new.
+    T* gradient_memory(size_t size) {
+        const auto fits = [=](const auto& unused) { return unused.first == size; };
+        const auto found = std::find_if(unused_.rbegin(), unused_.rend(), fits);  // the latest is still in the cache
+        if (found == unused_.rend()) return scratch<T>(size);
+        T* const memory = found->second;
+        unused_.erase(std::next(found).base());
+        return memory;
     }
 
     // Forgets all tensors made so far.
     void reset() {
         steps_.clear();
+        unused_.clear();
         arena_.reset();
     }
 
@@ -882,11 +891,28 @@ struct Tape {
     struct Step {
         void (*call)(void*);
         void* step;
-        const bool* untouched;
+        Tensor<T> result;
     };
     Arena arena_;
     std::vector<Step> steps_;
+    std::vector<std::pair<size_t, T*>> unused_;  // gradients that no step reads any more, with their sizes
 };
+
+// How the caller must store its contribution to x's gradient: the first one overwrites all of it. To be called once per
+// contribution, by the thread that runs backward().
+template <class T>
+Store next_store(Tensor<T> x) {
+    if (x.grad()) return Store::accumulate;
+    x.gradient->data = x.gradient->tape->gradient_memory(x.size());
+    return Store::overwrite;
+}
+
+// x's gradient, to be added to: zeros before the first contribution.
+template <class T>
+T* gradient_of(Tensor<T> x) {
+    if (next_store(x) == Store::overwrite) std::fill_n(x.grad(), x.size(), T(0));
+    return x.grad();
+}
 
 // Shares rows [0, rows) out in blocks; f(begin, end, worker) must treat each row alone. `work`: about how many
 // operations a row. Little work in all is done by the calling thread.
@@ -955,22 +981,25 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
     Compute& compute = tape.compute;
     matmul(compute, View<T>{y.value, count}, {x.value, x.columns}, {w.value + offset, w.columns, transposed, true},
            x.rows, count, x.columns, Store::overwrite, {affine.bias.value + first, relu});
-    T *dw = w.gradient + offset, *db = affine.bias.gradient + first;
+    const Tensor<T> bias = affine.bias;
     tape.on_backward(y, [=, &compute] {
+        T *const d_out = y.grad(), *const dw = w.grad() + offset, *const db = bias.grad() + first;
         // db += sum over rows of dy, which becomes the gradient before the activation on the way.
         const T* sums = block_sums<T>(compute, y.rows, count, [=](auto, ptrdiff_t row, T* sum) INLINE_LAMBDA {
-            T* const dy = y.gradient + row * count;
+            T* const dy = d_out + row * count;
             const T* const out = y.value + row * count;
             if (relu)
                 for (int j = 0; j < count; ++j) dy[j] = out[j] > 0 ? dy[j] : T(0);
             for (int j = 0; j < count; ++j) sum[j] += dy[j];
         });
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
-        const View<const T> dy = {y.gradient, count}, in = {x.value, x.columns};
-        const View<const T> dy_transposed = {y.gradient, count, true}, in_transposed = {x.value, x.columns, true};
-        if (x.gradient)  // dx += dy W^T
-            matmul(compute, View<T>{x.gradient, x.columns}, dy, {w.value + offset, w.columns, !transposed, true},
-                   x.rows, x.columns, count, next_store(x));
+        const View<const T> dy = {d_out, count}, in = {x.value, x.columns};
+        const View<const T> dy_transposed = {d_out, count, true}, in_transposed = {x.value, x.columns, true};
+        if (x.gradient) {  // dx += dy W^T
+            const Store store = next_store(x);
+            matmul(compute, View<T>{x.grad(), x.columns}, dy, {w.value + offset, w.columns, !transposed, true}, x.rows,
+                   x.columns, count, store);
+        }
         const View<T> d_weight = {dw, w.columns};
         if (transposed)  // dW^T += dy^T x
             matmul(compute, d_weight, dy_transposed, in, count, x.columns, x.rows, Store::accumulate);
@@ -1000,7 +1029,7 @@ void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T
         T* const gradient = gradient_of(from);
         for (ptrdiff_t i = 0; i < count; ++i) {
             T* const sum = gradient + (from_rows ? from_rows[i] : i) * d;
-            const T* const row = to.gradient + (to_rows ? to_rows[i] : i) * d;
+            const T* const row = to.grad() + (to_rows ? to_rows[i] : i) * d;
             for (ptrdiff_t j = 0; j < d; ++j) sum[j] += row[j];
         }
     });
@@ -1046,11 +1075,13 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
     });
     tape.on_backward(y, [=, &compute] {
         const Store store = next_store(x);
+        const T* const d_out = y.grad();
+        T* const d_in = x.grad();
         // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
         // A block's sums [4, d]: d_weight, d_bias, and room for a row's g and n beside them in the cache.
         const T* sums = block_sums<T>(compute, x.rows, 4 * d, [=](auto lanes, ptrdiff_t row, T* sum) INLINE_LAMBDA {
-            const T *in = x.value + row * d, *dy = y.gradient + row * d;
-            T *dx = x.gradient + row * d, *g = sum + 2 * d, *n = sum + 3 * d;
+            const T *in = x.value + row * d, *dy = d_out + row * d;
+            T *dx = d_in + row * d, *g = sum + 2 * d, *n = sum + 3 * d;
             const T mean = means[row], scale = scales[row];
             for (int j = 0; j < d; ++j) {
                 n[j] = (in[j] - mean) * scale;
@@ -1062,8 +1093,8 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
             if (store == Store::overwrite) std::fill_n(dx, d, T(0));
             for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
-        add_column_sums(compute, weight.gradient, sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
-        add_column_sums(compute, bias.gradient, sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
+        add_column_sums(compute, weight.grad(), sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
+        add_column_sums(compute, bias.grad(), sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
     });
     return y;
 }
@@ -1079,10 +1110,7 @@ struct Dropout {
     // factor [n] of the elements [first, first + n). Element e has word e % 4 of counter e / 4.
     template <class T>
     void fill(T* factor, size_t first, size_t n) const {
-        if (probability == 0) {
-            std::fill_n(factor, n, T(1));
-            return;
-        }
+        if (probability == 0) return static_cast<void>(std::fill_n(factor, n, T(1)));
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
         constexpr size_t counters = 32;
@@ -1113,22 +1141,6 @@ const T* dropout_factors(Tape<T>& tape, const Dropout& dropout, int rows, ptrdif
     return factors;
 }
 
-// x's gradient += dy * factor, element by element; factor null: += dy.
-template <class T>
-void add_product(Compute& compute, Tensor<T> x, const T* dy, const T* factor) {
-    const Store store = next_store(x);
-    for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
-        const ptrdiff_t first = static_cast<ptrdiff_t>(begin) * x.columns,
-                        last = static_cast<ptrdiff_t>(end) * x.columns;
-        vectorised<T>([=](auto) INLINE_LAMBDA {
-            for (ptrdiff_t i = first; i < last; ++i) {
-                const T product = factor ? dy[i] * factor[i] : dy[i];
-                x.gradient[i] = store == Store::overwrite ? product : x.gradient[i] + product;
-            }
-        });
-    });
-}
-
 // dropout(x) + residual, [n, d]; without the sum if the residual is empty.
 template <class T>
 Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor<T> residual = {}) {
@@ -1144,9 +1156,19 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
                 for (ptrdiff_t i = begin * d; i < end * d; ++i) y.value[i] += residual.value[i];
         });
     });
-    tape.on_backward(y, [=, &compute] {
-        add_product(compute, x, y.gradient, factor);
-        if (residual.gradient) add_product<T>(compute, residual, y.gradient, nullptr);
+    tape.on_backward(y, [=, &compute] {  // dx += dy * factor; d_residual += dy
+        const bool set_x = next_store(x) == Store::overwrite;
+        const bool set_residual = residual.gradient && next_store(residual) == Store::overwrite;
+        const T* const dy = y.grad();
+        T *const dx = x.grad(), *const d_residual = residual.gradient ? residual.grad() : nullptr;
+        for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
+            vectorised<T>([=](auto) INLINE_LAMBDA {
+                for (ptrdiff_t i = begin * d; i < end * d; ++i) dx[i] = (set_x ? T(0) : dx[i]) + dy[i] * factor[i];
+                if (d_residual)
+                    for (ptrdiff_t i = begin * d; i < end * d; ++i)
+                        d_residual[i] = (set_residual ? T(0) : d_residual[i]) + dy[i];
+            });
+        });
     });
     return y;
 }
@@ -1275,7 +1297,7 @@ struct AttentionPass {
             T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
             const T* const factor = factors + head_at(i, h);
             // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
-            dot_rows<Width>(dw, out.gradient + i * d + column, rows, seen, size, T(1));
+            dot_rows<Width>(dw, out.grad() + i * d + column, rows, seen, size, T(1));
             for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
             const T mean = dot<Width>(w, dw, seen);
             for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
@@ -1284,13 +1306,13 @@ struct AttentionPass {
         // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
         gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
         for (ptrdiff_t i = first; i < end; ++i)
-            add_weighted_rows<Width>(q.gradient + i * q.columns + column, d_weights + head_at(i, h), 1, rows,
+            add_weighted_rows<Width>(q.grad() + i * q.columns + column, d_weights + head_at(i, h), 1, rows,
                                      seen_by(i, span), size, to_q);
         // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
         gather_rows(rows, q.value + first * q.columns + column, q.columns, span.queries, size);
-        add_to_keys<Width>(kv.gradient + first_key, d_weights, span, h, rows, to_kv);
-        gather_rows(rows, out.gradient + first * d + column, d, span.queries, size);
-        add_to_keys<Width>(kv.gradient + first_key + d, weights, span, h, rows, to_kv);
+        add_to_keys<Width>(kv.grad() + first_key, d_weights, span, h, rows, to_kv);
+        gather_rows(rows, out.grad() + first * d + column, d, span.queries, size);
+        add_to_keys<Width>(kv.grad() + first_key + d, weights, span, h, rows, to_kv);
     }
 
     // d_key_j = or += sum over the queries i that see j of weight_ij row_i; rows [span.queries, size].
@@ -1371,8 +1393,12 @@ struct Parameter {
     std::string name;             // ODT's name in its state_dict
     std::vector<uint64_t> shape;  // as saved
     std::vector<T> value;
-    std::vector<T> gradient;  // accumulated until an update takes it
-    Tensor<T> tensor() { return {value.data(), gradient.data(), rows(), static_cast<int>(shape.back())}; }
+    std::vector<T> gradient;          // accumulated until an update takes it
+    Gradient<T> gradient_place = {};  // for tensor(), which must not outlive a move of this parameter
+    Tensor<T> tensor() {
+        gradient_place.data = gradient.data();
+        return {value.data(), &gradient_place, rows(), static_cast<int>(shape.back())};
+    }
     int rows() const { return shape.size() == 1 ? 1 : static_cast<int>(shape[0]); }
 };
 
@@ -1475,6 +1501,7 @@ struct Transformer {
                 "a transformer cannot have %d state and %d action dimensions, %d positions and dropout %g: it needs at "
                 "least one of each dimension, no more action dimensions than its width, %d, and dropout in [0, 1)",
                 c.state_dim, c.action_dim, c.max_timesteps, static_cast<double>(c.dropout), d);
+        parameters.reserve(20 + 12 * static_cast<size_t>(c.layers));  // tensors point to them
         embed_return = linear_layer("embed_return", 1, d, Init::uniform_fan_in, seed);
         embed_state = linear_layer("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
         embed_action = linear_layer("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);
@@ -1516,7 +1543,7 @@ struct Transformer {
         parameter.value.resize(size);
         parameter.gradient.resize(size);
         initialise(parameter, init, fan_in, seed, parameters.size());
-        parameters.push_back(std::move(parameter));  // moving a vector keeps its memory: tensors stay valid
+        parameters.push_back(std::move(parameter));
         return parameters.back().tensor();
     }
     Affine<T> linear_layer(const std::string& name, int in, int out, Init init, uint32_t seed) {
@@ -1642,7 +1669,7 @@ Tensor<T> elementwise(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
     for (size_t i = 0; i < x.size(); ++i) y.value[i] = f(x.value[i]);
     tape.on_backward(y, [=] {
         T* const dx = gradient_of(x);
-        for (size_t i = 0; i < x.size(); ++i) dx[i] += slope(x.value[i], y.value[i]) * y.gradient[i];
+        for (size_t i = 0; i < x.size(); ++i) dx[i] += slope(x.value[i], y.value[i]) * y.grad()[i];
     });
     return y;
 }
@@ -1678,7 +1705,7 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
     tape.on_backward(y, [=] {
         T* const dx = gradient_of(logits);
         for (ptrdiff_t row = 0; row < logits.rows; ++row) {
-            const T *dy = y.gradient + row * actions, *log_p = y.value + row * actions;
+            const T *dy = y.grad() + row * actions, *log_p = y.value + row * actions;
             T total = 0;
             for (ptrdiff_t j = 0; j < actions; ++j) total += dy[j];
             for (ptrdiff_t j = 0; j < actions; ++j) dx[row * actions + j] += dy[j] - std::exp(log_p[j]) * total;
@@ -1736,8 +1763,9 @@ Tensor<T> row_sums(Tape<T>& tape, std::array<Tensor<T>, 2> inputs, int rows, int
     const ptrdiff_t n = static_cast<ptrdiff_t>(rows) * columns;
     for (ptrdiff_t i = 0; i < n; ++i) y.value[i / columns] += value(i);
     tape.on_backward(y, [=] {
-        for (const Tensor<T>& input : inputs) gradient_of(input);
-        for (ptrdiff_t i = 0; i < n; ++i) slope(i, y.gradient[i / columns]);
+        for (const Tensor<T>& input : inputs)
+            if (input.gradient) gradient_of(input);
+        for (ptrdiff_t i = 0; i < n; ++i) slope(i, y.grad()[i / columns]);
     });
     return y;
 }
@@ -1757,8 +1785,8 @@ Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* action
     };
     return row_sums(tape, {mean, log_std}, a.rows, a.columns, value, [=](ptrdiff_t i, T dy) {
         const T z = standardised(i);
-        mean.gradient[i] += dy * z / std::exp(log_std.value[i]);
-        log_std.gradient[i] += dy * (z * z - T(1));
+        mean.grad()[i] += dy * z / std::exp(log_std.value[i]);
+        log_std.grad()[i] += dy * (z * z - T(1));
     });
 }
 
@@ -1774,8 +1802,8 @@ Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) 
     };
     return row_sums(tape, {mean, log_std}, n.rows, n.columns, value, [=](ptrdiff_t i, T dy) {
         const T slope = T(-2) * std::tanh(sample(i));  // of log_tanh_slope
-        mean.gradient[i] += dy * slope;
-        log_std.gradient[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
+        mean.grad()[i] += dy * slope;
+        log_std.grad()[i] += dy * (T(1) + slope * std::exp(log_std.value[i]) * n.value[i]);
     });
 }
 
@@ -1786,7 +1814,7 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
     const auto named = [=](ptrdiff_t row) { return row * log_p.columns + static_cast<ptrdiff_t>(a.value[row]); };
     return row_sums(
         tape, {log_p}, a.rows, 1, [=](ptrdiff_t row) { return log_p.value[named(row)]; },
-        [=](ptrdiff_t row, T dy) { log_p.gradient[named(row)] += dy; });
+        [=](ptrdiff_t row, T dy) { log_p.grad()[named(row)] += dy; });
 }
 
 // H = -sum p log p, exact.
@@ -1795,7 +1823,7 @@ Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
     return row_sums(
         tape, {log_p}, log_p.rows, log_p.columns,
         [=](ptrdiff_t i) { return -std::exp(log_p.value[i]) * log_p.value[i]; },
-        [=](ptrdiff_t i, T dy) { log_p.gradient[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
+        [=](ptrdiff_t i, T dy) { log_p.grad()[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
 // DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions. actions [n, A].
@@ -1805,7 +1833,7 @@ Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* action
     const auto error = [=](ptrdiff_t i) { return prediction.value[i] - a.value[i]; };
     return row_sums(
         tape, {prediction}, a.rows, a.columns, [=](ptrdiff_t i) { return error(i) * error(i) / T(a.columns); },
-        [=](ptrdiff_t i, T dy) { prediction.gradient[i] += dy * T(2) * error(i) / T(a.columns); });
+        [=](ptrdiff_t i, T dy) { prediction.grad()[i] += dy * T(2) * error(i) / T(a.columns); });
 }
 
 // log pi(a) of each row, [n, 1]; for DT's deterministic head, minus its loss.
@@ -1832,7 +1860,7 @@ Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
     const Tensor<T> c = tape.constant(coefficients, x.rows, 1);
     return row_sums(
         tape, {x}, 1, x.rows, [=](ptrdiff_t i) { return c.value[i] * x.value[i]; },
-        [=](ptrdiff_t i, T dy) { x.gradient[i] += c.value[i] * dy; });
+        [=](ptrdiff_t i, T dy) { x.grad()[i] += c.value[i] * dy; });
 }
 
 // a x + b y, [1, 1].
@@ -1841,8 +1869,8 @@ Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
     const Tensor<T> z = tape.make(1, 1);
     z.value[0] = a * x.value[0] + b * y.value[0];
     tape.on_backward(z, [=] {
-        *gradient_of(x) += a * z.gradient[0];
-        *gradient_of(y) += b * z.gradient[0];
+        *gradient_of(x) += a * z.grad()[0];
+        *gradient_of(y) += b * z.grad()[0];
     });
     return z;
 }

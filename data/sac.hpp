@@ -141,15 +141,17 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
     if (rectified)
         for (size_t i = 0; i < y.size(); ++i) y.value[i] = y.value[i] < 0 ? T(0) : y.value[i];  // NaN stays
     tape.on_backward(y, [=, &compute] {
-        const View<const T> dy = {y.gradient, out}, dy_transposed = {y.gradient, out, true};
+        const View<const T> dy = {y.grad(), out}, dy_transposed = {y.grad(), out, true};
         if (rectified)
-            for (size_t i = 0; i < y.size(); ++i) y.gradient[i] = y.value[i] > 0 ? y.gradient[i] : T(0);
-        if (x.gradient)  // dx += dy W
-            matmul(compute, View<T>{x.gradient, in}, dy, {w.value, in}, x.rows, in, out, next_store(x));
+            for (size_t i = 0; i < y.size(); ++i) y.grad()[i] = y.value[i] > 0 ? y.grad()[i] : T(0);
+        if (x.gradient) {  // dx += dy W
+            const Store store = next_store(x);
+            matmul(compute, View<T>{x.grad(), in}, dy, {w.value, in}, x.rows, in, out, store);
+        }
         if (!trained) return;
         // dW += dy^T x
-        matmul(compute, View<T>{w.gradient, in}, dy_transposed, {x.value, in}, out, in, x.rows, Store::accumulate);
-        add_column_sums(compute, b.gradient, y.gradient, y.rows, out, out);
+        matmul(compute, View<T>{w.grad(), in}, dy_transposed, {x.value, in}, out, in, x.rows, Store::accumulate);
+        add_column_sums(compute, b.grad(), y.grad(), y.rows, out, out);
     });
     return y;
 }
@@ -243,7 +245,7 @@ Tensor<T> pairs_of(Tape<T>& tape, Tensor<T> states, Tensor<T> actions) {
     tape.on_backward(pairs, [=] {
         T* const d_actions = gradient_of(actions);
         for (ptrdiff_t i = 0; i < actions.rows; ++i)
-            for (ptrdiff_t j = 0; j < A; ++j) d_actions[i * A + j] += pairs.gradient[i * (S + A) + S + j];
+            for (ptrdiff_t j = 0; j < A; ++j) d_actions[i * A + j] += pairs.grad()[i * (S + A) + S + j];
     });
     return pairs;
 }
@@ -258,7 +260,7 @@ Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> a
     for (ptrdiff_t i = 0; i < y.rows; ++i) y.value[i] = q1.value[i] < q0.value[i] ? q1.value[i] : q0.value[i];
     tape.on_backward(y, [=] {
         T *const d_q0 = gradient_of(q0), *const d_q1 = gradient_of(q1);
-        for (ptrdiff_t i = 0; i < y.rows; ++i) (q1.value[i] < q0.value[i] ? d_q1 : d_q0)[i] += y.gradient[i];
+        for (ptrdiff_t i = 0; i < y.rows; ++i) (q1.value[i] < q0.value[i] ? d_q1 : d_q0)[i] += y.grad()[i];
     });
     return y;
 }

@@ -235,7 +235,8 @@ void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threa
     };
     Parameter<float> weight{"", {d}, std::vector<float>(d, 1.0f), std::vector<float>(d)}, bias = weight;
     std::vector<float> values(static_cast<size_t>(tokens) * d * 3, 0.5f), gradients(values.size());
-    const auto tensor = [&](int columns) { return Tensor<float>{values.data(), gradients.data(), tokens, columns}; };
+    Gradient<float> gradient = {gradients.data()};
+    const auto tensor = [&](int columns) { return Tensor<float>{values.data(), &gradient, tokens, columns}; };
     const std::vector<float> coefficients(tokens, 1.0f);
     Tensor<float> y;
     const auto backward = [&] {

@@ -363,6 +363,7 @@ struct Graph {
         std::string name;
         Array<T> array;
         std::vector<T> gradient;
+        Gradient<T> place;  // the tensor's, whose data are `gradient`
     };
     struct Output {
         std::string name;
@@ -376,14 +377,15 @@ struct Graph {
     explicit Graph(Case& a_case) : c(a_case), tape(a_case.compute) {}
 
     Tensor<T> variable(const std::string& name, const Shape& pattern) {
-        variables.push_back(std::make_unique<Variable>(Variable{name, c.in<T>(name, pattern), {}}));
+        variables.push_back(std::make_unique<Variable>(Variable{name, c.in<T>(name, pattern), {}, {}}));
         Variable& v = *variables.back();
         v.gradient.resize(v.array.values.size());
         if (v.array.back() < 1 || v.array.values.size() >= 1u << 31)
             fail("check.shape", "%s: has shape %s, expected at least one column and less than 2^31 numbers",
                  c.where(c.need("in/" + name)).c_str(), shape_text(v.array.shape).c_str());
         const bool row = v.array.shape.size() == 1;
-        return {v.array.values.data(), v.gradient.data(), row ? 1 : v.array.extent(0), v.array.back()};
+        v.place.data = v.gradient.data();
+        return {v.array.values.data(), &v.place, row ? 1 : v.array.extent(0), v.array.back()};
     }
 
     void finish(const std::vector<Output>& outputs) {
@@ -566,7 +568,7 @@ void check_attention(Case& c) {
     each([&](ptrdiff_t to, ptrdiff_t from) { kv.value[to] = k.value[from], kv.value[to + d] = v.value[from]; });
     graph.tape.on_backward(kv, [=] {
         each([=](ptrdiff_t from, ptrdiff_t to) {
-            k.gradient[to] += kv.gradient[from], v.gradient[to] += kv.gradient[from + d];
+            k.grad()[to] += kv.grad()[from], v.grad()[to] += kv.grad()[from + d];
         });
     });
     std::vector<Span> spans;
@@ -729,7 +731,7 @@ struct LayerOutputs {
         std::string name;
         Shape shape;
         std::vector<T> value;  // a copy: backward() may reuse the tape's memory
-        const T* gradient;
+        const Gradient<T>* gradient;
     };
     std::vector<Output> outputs;
 
@@ -1632,7 +1634,7 @@ void check_step(Case& c) {
         for (const auto& output : layers.outputs) {
             c.expect("layer/" + output.name, output.shape, output.value, true);
             c.expect("layer_gradient/" + output.name, output.shape,
-                     std::vector<T>(output.gradient, output.gradient + output.value.size()), true);
+                     std::vector<T>(output.gradient->data, output.gradient->data + output.value.size()), true);
         }
         if (update == 1)
             for (const Parameter<T>& parameter : model->parameters)

@@ -119,7 +119,7 @@ void dump_update(Run& run, const std::string& path) {
     for (const auto& output : layers.outputs) {
         dump.add("out/layer/" + output.name, output.shape, output.value);
         dump.add("out/layer_gradient/" + output.name, output.shape,
-                 std::span<const float>(output.gradient, output.value.size()));
+                 std::span<const float>(output.gradient->data, output.value.size()));
     }
     for (const Parameter<float>& parameter : parameters)
         dump.add("out/gradient/" + parameter.name, parameter.shape,

@@ -1028,8 +1028,7 @@ TEST(squashed_gaussian_is_finite_at_the_extremes) {
                 const Tensor<float> log_p = gaussian_log_prob(tape, policy, &action),
                                     entropy = gaussian_entropy(tape, policy, &noise);
                 tape.backward(combine(tape, 1.0f, log_p, 1.0f, entropy));
-                for (const float x :
-                     {log_p.value[0], entropy.value[0], *policy.output.gradient, *policy.log_std.gradient})
+                for (const float x : {log_p.value[0], entropy.value[0], *policy.output.grad(), *policy.log_std.grad()})
                     CHECK(std::isfinite(x));
             }
     CHECK_CLOSE(log_tanh_slope(50.0), 2 * (std::log(2.0) - 50), 1e-13);

@@ -214,11 +214,11 @@ TEST(sac_standard_deviations_are_clamped_and_the_extremes_are_finite) {
     CHECK_EQUAL(sample.action.value[3], -1.0f);
     const float ones[] = {1, 1, 1, 1};
     tape.backward(weighted_sum(tape, sample.log_prob, ones));
-    for (size_t i = 0; i < 8; ++i) CHECK(std::isfinite(output.gradient[i]));
+    for (size_t i = 0; i < 8; ++i) CHECK(std::isfinite(output.grad()[i]));
     for (size_t i = 0; i < 4; ++i) CHECK(std::isfinite(sample.log_prob.value[i]));
-    CHECK_EQUAL(output.gradient[1], 0.0f);  // outside the clamp
-    CHECK_EQUAL(output.gradient[3], 0.0f);
-    CHECK(output.gradient[5] != 0 && output.gradient[7] != 0);  // on its edges
+    CHECK_EQUAL(output.grad()[1], 0.0f);  // outside the clamp
+    CHECK_EQUAL(output.grad()[3], 0.0f);
+    CHECK(output.grad()[5] != 0 && output.grad()[7] != 0);  // on its edges
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
