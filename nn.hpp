@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <bit>
 #include <cmath>
 #include <condition_variable>
 #include <cstdarg>
@@ -369,46 +370,67 @@ using TileFunction = void (*)(const Tile& tile, const void* a, const void* b, in
 // panel is view(first_k + k, first_line + line).
 using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_line, int depth, int used);
 
-// One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone, and
-// panels are opaque to it, so a kernel may store elements in another format (bf16, say) by packing functions of its own.
+// One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone; panels
+// are opaque to it.
 struct Kernel {
     const char* name;
+    const char* precision;  // "fp32", or "bf16": A and B are rounded to bf16, sums stay float
     // Kernels of equal arithmetic give the same bits: "fused" rounds once for a multiply-add, "plain" twice, as
-    // matmul_plain does.
+    // matmul_plain does; "bf16" is the arithmetic of bf16_multiply_add.
     const char* arithmetic;
     int tile_rows, tile_columns;
-    size_t element_bytes;  // of one element in a panel
-    bool (*supported)();   // by this machine
+    int k_a_word;         // values of k that a word of 4 bytes in a panel holds: one float or two bf16
+    bool (*supported)();  // by this machine
     PackFunction pack_a, pack_b;
     TileFunction tile;
 
-    // Bytes of panels of `lines` lines in all, `depth` elements each.
-    size_t panel_bytes(int lines, int depth) const { return element_bytes * lines * depth; }
+    // Bytes of panels of `lines` lines in all, `depth` values of k each.
+    size_t panel_bytes(int lines, int depth) const { return size_t{4} * lines * divide_up(depth, k_a_word); }
 };
 
-// sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so the fused form is one instruction by name.
-template <bool Fused, class V>
-ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
-#ifdef X86_KERNELS
-    if constexpr (Fused) {
-        asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
-        return;
-    }
-#endif
-    sum += a * b;
+// bf16 is the upper half of a float: 8 bits of mantissa, the leading one included. Rounds to nearest even; NaN stays.
+ALWAYS_INLINE uint32_t to_bf16(float x) {
+    const uint32_t bits = std::bit_cast<uint32_t>(x);
+    return x == x ? (bits + 0x7fff + (bits >> 16 & 1)) >> 16 : bits >> 16 | 0x40;
 }
 
-// TileFunction for panels of floats: `Rows` rows of `Vectors` vectors of `Width` floats, held in registers while k runs.
-template <int Rows, int Vectors, int Width, bool Fused>
-ALWAYS_INLINE void tile_of_floats(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
-    constexpr int columns = Width * Vectors;
+// sum + a_odd b_odd, rounded, then + a_even b_even, rounded, for words that hold bf16 of an odd k in the upper half and
+// of the even k before it in the lower: the definition of the bf16 products. It is what x86's vdpbf16ps computes in
+// each lane (Intel SDM): subnormal inputs, sums and results count as zero.
+ALWAYS_INLINE float bf16_multiply_add(float sum, float a_word, float b_word) {
+    const auto normal = [](float x) { return std::abs(x) < 0x1p-126f ? std::copysign(0.0f, x) : x; };
+    const auto value = [=](uint32_t bits) { return normal(std::bit_cast<float>(bits)); };
+    const uint32_t a = std::bit_cast<uint32_t>(a_word), b = std::bit_cast<uint32_t>(b_word);
+    sum = normal(std::fma(value(a & 0xffff0000), value(b & 0xffff0000), normal(sum)));
+    return normal(std::fma(value(a << 16), value(b << 16), sum));
+}
+
+enum class Multiply { plain, fused, bf16, bf16_portable };
+constexpr bool in_bf16(Multiply how) { return how == Multiply::bf16 || how == Multiply::bf16_portable; }
+
+// sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so two forms are one instruction by name.
+template <Multiply How, class V>
+ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
+#ifdef X86_KERNELS
+    if constexpr (How == Multiply::fused) asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
+    if constexpr (How == Multiply::bf16) asm("vdpbf16ps %2, %1, %0" : "+v"(sum) : "v"(a), "v"(b));
+#endif
+    if constexpr (How == Multiply::plain) sum += a * b;
+    if constexpr (How == Multiply::bf16_portable)
+        for (size_t i = 0; i < sizeof(V) / sizeof(float); ++i) sum[i] = bf16_multiply_add(sum[i], a[i], b[i]);
+}
+
+// TileFunction: `Rows` rows of `Vectors` vectors of `Width` sums, held in registers while k runs, word by word.
+template <int Rows, int Vectors, int Width, Multiply How>
+ALWAYS_INLINE void compute_tile(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
+    constexpr int columns = Width * Vectors, k_a_word = in_bf16(How) ? 2 : 1;
     const float *a = static_cast<const float*>(a_panel), *b = static_cast<const float*>(b_panel);
     // C may be far from the cache, and is needed only at the end.
     for (int r = 0; r < tile.rows; ++r)
         for (int j = 0; j < tile.columns; j += 16)
             __builtin_prefetch(tile.c + static_cast<ptrdiff_t>(r) * tile.stride + j, 1);
     Vector<float, Width> sum[Rows][Vectors] = {};
-    for (int k = 0; k < depth; ++k) {
+    for (int k = 0; k < depth; k += k_a_word) {
         Vector<float, Width> row_of_b[Vectors];
 #pragma GCC unroll 4
         for (int v = 0; v < Vectors; ++v) {
@@ -417,9 +439,11 @@ ALWAYS_INLINE void tile_of_floats(const Tile& tile, const void* a_panel, const v
         }
 #pragma GCC unroll 16
         for (int r = 0; r < Rows; ++r) {
-            const Vector<float, Width> element_of_a = a[r] - Vector<float, Width>{};  // a broadcast: x - 0 is x
+            // A broadcast: the word less zero in each lane, as a whole number, which changes no bit of it.
+            const auto word_of_a =
+                reinterpret_cast<Vector<float, Width>>(std::bit_cast<int32_t>(a[r]) - Vector<int32_t, Width>{});
 #pragma GCC unroll 4
-            for (int v = 0; v < Vectors; ++v) multiply_add<Fused>(sum[r][v], element_of_a, row_of_b[v]);
+            for (int v = 0; v < Vectors; ++v) multiply_add<How>(sum[r][v], word_of_a, row_of_b[v]);
         }
         a += Rows;
         b += columns;
@@ -481,39 +505,84 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_line, 
     }
 }
 
-// The record of a kernel for floats with tiles of Rows x Columns.
-template <int Rows, int Columns>
-constexpr Kernel float_kernel(const char* name, const char* arithmetic, bool (*supported)(), TileFunction tile) {
-    return {name, arithmetic, Rows, Columns, sizeof(float), supported, pack_floats<Rows>, pack_floats<Columns>, tile};
+// PackFunction for bf16: the panel is [depth / 2, Width] words, of k and k + 1; where depth is odd, the last has one zero.
+template <int Width>
+ALWAYS_INLINE void pack_bf16(void* to, View<const float> view, int first_k, int first_line, int depth, int used) {
+    const auto word = [](float even, float odd) { return std::bit_cast<float>(to_bf16(even) | to_bf16(odd) << 16); };
+    const int pairs = depth / 2, words = divide_up(depth, 2), last = first_k + depth - 1;
+    float buffer[sum_block / 2 * Width];  // words in the order of the view: [words, Width], or [Width, words]
+    const ptrdiff_t per_word = view.transposed ? 1 : Width, per_line = view.transposed ? words : 1;
+    if (view.transposed)
+        for (int line = 0; line < used; ++line) {
+            const float* const from = &view(first_k, first_line + line);
+            for (int w = 0; w < pairs; ++w) buffer[line * words + w] = word(from[2 * w], from[2 * w + 1]);
+        }
+    else
+        for (int w = 0; w < pairs; ++w) {
+            const float *even = &view(first_k + 2 * w, first_line), *odd = &view(first_k + 2 * w + 1, first_line);
+            for (int line = 0; line < used; ++line) buffer[w * Width + line] = word(even[line], odd[line]);
+        }
+    for (int line = 0; pairs < words && line < used; ++line)
+        buffer[pairs * per_word + line * per_line] = word(view(last, first_line + line), 0);
+    pack_floats<Width>(to, {buffer, view.transposed ? words : Width, view.transposed}, 0, 0, words, used);
+}
+
+// A kernel's record; tile and packing must be compiled for its instructions.
+template <Multiply How, int Rows, int Columns>
+constexpr Kernel make_kernel(const char* name, bool (*supported)(), PackFunction pack_a, PackFunction pack_b,
+                             TileFunction tile) {
+    const char* const arithmetic = in_bf16(How) ? "bf16" : How == Multiply::fused ? "fused" : "plain";
+    const char* const precision = in_bf16(How) ? "bf16" : "fp32";
+    return {name, precision, arithmetic, Rows, Columns, in_bf16(How) ? 2 : 1, supported, pack_a, pack_b, tile};
 }
 
 #ifdef X86_KERNELS
 __attribute__((target("avx512f"))) inline void tile_avx512(const Tile& tile, const void* a, const void* b, int depth) {
-    tile_of_floats<12, 2, 16, true>(tile, a, b, depth);
+    compute_tile<12, 2, 16, Multiply::fused>(tile, a, b, depth);
 }
-inline const Kernel kernel_avx512 = float_kernel<12, 32>(
-    "avx512", "fused", [] { return __builtin_cpu_supports("avx512f") != 0; }, tile_avx512);
+inline const Kernel kernel_avx512 = make_kernel<Multiply::fused, 12, 32>(
+    "avx512", [] { return __builtin_cpu_supports("avx512f") != 0; }, pack_floats<12>, pack_floats<32>, tile_avx512);
 
 __attribute__((target("avx2,fma"))) inline void tile_avx2(const Tile& tile, const void* a, const void* b, int depth) {
-    tile_of_floats<6, 2, 8, true>(tile, a, b, depth);
+    compute_tile<6, 2, 8, Multiply::fused>(tile, a, b, depth);
 }
-inline const Kernel kernel_avx2 = float_kernel<6, 16>(
-    "avx2", "fused", [] { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }, tile_avx2);
+inline const Kernel kernel_avx2 = make_kernel<Multiply::fused, 6, 16>(
+    "avx2", [] { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }, pack_floats<6>,
+    pack_floats<16>, tile_avx2);
+
+__attribute__((target("arch=x86-64-v4,avx512bf16"))) inline void tile_avx512_bf16(const Tile& tile, const void* a,
+                                                                                  const void* b, int depth) {
+    compute_tile<12, 2, 16, Multiply::bf16>(tile, a, b, depth);
+}
+template <int Width>
+__attribute__((target("arch=x86-64-v4"))) void pack_bf16_avx512(void* to, View<const float> view, int first_k,
+                                                                int first_line, int depth, int used) {
+    pack_bf16<Width>(to, view, first_k, first_line, depth, used);
+}
+inline const Kernel kernel_avx512_bf16 = make_kernel<Multiply::bf16, 12, 32>(
+    "avx512", [] { return has_avx512 && __builtin_cpu_supports("avx512bf16"); }, pack_bf16_avx512<12>,
+    pack_bf16_avx512<32>, tile_avx512_bf16);
 #endif
 inline void tile_portable(const Tile& tile, const void* a, const void* b, int depth) {
-    tile_of_floats<4, 2, 4, false>(tile, a, b, depth);
+    compute_tile<4, 2, 4, Multiply::plain>(tile, a, b, depth);
 }
-inline const Kernel kernel_portable = float_kernel<4, 8>(
-    "portable", "plain", [] { return true; }, tile_portable);
+inline const Kernel kernel_portable = make_kernel<Multiply::plain, 4, 8>(
+    "portable", [] { return true; }, pack_floats<4>, pack_floats<8>, tile_portable);
 
-// All kernels of this program, best first. A kernel of reduced precision would stand here as one more record.
+inline void tile_portable_bf16(const Tile& tile, const void* a, const void* b, int depth) {
+    compute_tile<4, 2, 4, Multiply::bf16_portable>(tile, a, b, depth);
+}
+inline const Kernel kernel_portable_bf16 = make_kernel<Multiply::bf16_portable, 4, 8>(
+    "portable", [] { return true; }, pack_bf16<4>, pack_bf16<8>, tile_portable_bf16);
+
+// All kernels of this program, of each precision the best first.
 inline const Kernel* const kernels[] = {
 #ifdef X86_KERNELS
-    &kernel_avx512, &kernel_avx2,
+    &kernel_avx512, &kernel_avx2, &kernel_avx512_bf16,
 #endif
-    &kernel_portable};
+    &kernel_portable, &kernel_portable_bf16};
 
-// The fastest kernel that this machine supports.
+// The fastest kernel for fp32, the default precision, that this machine supports.
 inline const Kernel& best_kernel() {
     return **std::find_if(std::begin(kernels), std::end(kernels), [](const Kernel* k) { return k->supported(); });
 }
@@ -687,52 +756,28 @@ inline void matmul(Compute& compute, View<double> c, View<const double> a, View<
 // ---------------------------------------------------------------------------------------------------------------------
 // Dot products.
 
-// y_r = x . row_r for the rows r < Rows <= 4 of rows [Rows, n], which lie `stride` apart. The order of additions is
-// part of the definition: lane i mod 16 sums the products i in order; the 16 lanes are folded in halves; the products
-// beyond the last 16 are summed in order and added at the end. A sum in lanes is faster than one chain of additions.
-//
-//     lanes   0 1 2 ... 15     16 sums of a row
-//     fold    l + (l + 8)      8 of a row, then with 4, 2 and 1 for 8: 4, 2 and 1 of a row
-//
-// From the second fold on, two rows, then four, share a vector: [a b] = [a low, b low] + [a high, b high].
-template <int Rows, int Width, class T>
-ALWAYS_INLINE void dots(T* y, const T* x, const T* rows, ptrdiff_t stride, ptrdiff_t n) {
-    Vector<T, Width> sum[4][16 / Width] = {};
+// a . b, of [n] each. The order of additions is part of the definition: lane l of 16 sums the products l, l + 16, ... in
+// order; the lanes are folded in halves (lane l with l + 8, then with l + 4, l + 2, l + 1); the products beyond the last
+// whole 16 are summed in order and added at the end. In a single chain each addition would wait for the one before.
+// Width: how many lanes a vector has.
+template <int Width = 8, class T>
+ALWAYS_INLINE T dot(const T* a, const T* b, ptrdiff_t n) {
+    Vector<T, Width> sum[16 / Width] = {};
     ptrdiff_t i = 0;
     for (; i + 16 <= n; i += 16)
-        for (ptrdiff_t r = 0; r < Rows; ++r)
-            for (ptrdiff_t h = 0; h < 16; h += Width)
-                sum[r][h / Width] += lanes_at<Width>(x + i + h) * lanes_at<Width>(rows + r * stride + i + h);
-    Vector<T, 8> eight[4], four_of_two[2];
-    for (size_t r = 0; r < 4; ++r)
-        if constexpr (Width == 16)
-            eight[r] = __builtin_shufflevector(sum[r][0], sum[r][0], 0, 1, 2, 3, 4, 5, 6, 7) +
-                       __builtin_shufflevector(sum[r][0], sum[r][0], 8, 9, 10, 11, 12, 13, 14, 15);
-        else
-            eight[r] = sum[r][0] + sum[r][1];
-    for (size_t pair = 0; pair < 2; ++pair) {
-        const Vector<T, 8>&a = eight[2 * pair], &b = eight[2 * pair + 1];
-        four_of_two[pair] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) +
-                            __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
-    }
-    const Vector<T, 8>&a = four_of_two[0], &b = four_of_two[1];
-    const Vector<T, 8> two_of_four = __builtin_shufflevector(a, b, 0, 1, 4, 5, 8, 9, 12, 13) +
-                                     __builtin_shufflevector(a, b, 2, 3, 6, 7, 10, 11, 14, 15);
-    const auto one_of_four = __builtin_shufflevector(two_of_four, two_of_four, 0, 2, 4, 6) +
-                             __builtin_shufflevector(two_of_four, two_of_four, 1, 3, 5, 7);
-    for (ptrdiff_t r = 0; r < Rows; ++r) {
-        T rest = 0;
-        for (ptrdiff_t j = i; j < n; ++j) rest += x[j] * rows[r * stride + j];
-        y[r] = one_of_four[r] + rest;
-    }
-}
-
-// a . b, of [n] each, in the same order. Width: inside vectorised(), its number of lanes.
-template <int Width = 8, class T>
-ALWAYS_INLINE T dot(const T* a, const T* b, int n) {
-    T y;
-    dots<1, Width>(&y, a, b, 0, n);
-    return y;
+        for (ptrdiff_t h = 0; h < 16; h += Width)
+            sum[h / Width] += lanes_at<Width>(a + i + h) * lanes_at<Width>(b + i + h);
+    Vector<T, 8> eight;
+    if constexpr (Width == 16)
+        eight = __builtin_shufflevector(sum[0], sum[0], 0, 1, 2, 3, 4, 5, 6, 7) +
+                __builtin_shufflevector(sum[0], sum[0], 8, 9, 10, 11, 12, 13, 14, 15);
+    else
+        eight = sum[0] + sum[1];
+    const auto four =
+        __builtin_shufflevector(eight, eight, 0, 1, 2, 3) + __builtin_shufflevector(eight, eight, 4, 5, 6, 7);
+    T rest = 0;
+    for (; i < n; ++i) rest += a[i] * b[i];
+    return (four[0] + four[2]) + (four[1] + four[3]) + rest;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1193,15 +1238,6 @@ void attention_plain(T* out, const T* q, const T* k, const T* v, int n, int d) {
     }
 }
 
-// y_j = scale (x . row_j) for rows [n, size].
-template <int Width, class T>
-ALWAYS_INLINE void dot_rows(T* y, const T* x, const T* rows, int n, int size, T scale) {
-    ptrdiff_t j = 0;
-    for (; j + 4 <= n; j += 4) dots<4, Width>(y + j, x, rows + j * size, size, size);
-    for (; j < n; ++j) y[j] = dot<Width>(x, rows + j * size, size);
-    for (j = 0; j < n; ++j) y[j] *= scale;
-}
-
 // to = or += sum_j weight_j row_j, for Width * Vectors columns, held in registers (where there are enough).
 template <int Width, int Vectors, class T>
 ALWAYS_INLINE void add_columns(T* to, const T* weight, ptrdiff_t weight_stride, const T* rows, ptrdiff_t stride, int n,
@@ -1276,7 +1312,8 @@ struct AttentionPass {
         gather_rows(rows, keys, stride, span.tokens, size);
         for (ptrdiff_t i = span.first_query; i < end; ++i) {
             T* const w = weights + head_at(i, h);
-            dot_rows<Width>(w, q.value + i * q.columns + h * size, rows, seen_by(i, span), size, scale);
+            const T* const query = q.value + i * q.columns + h * size;
+            for (int j = 0; j < seen_by(i, span); ++j) w[j] = dot<Width>(query, rows + j * size, size) * scale;
             softmax(w, seen_by(i, span));
         }
         gather_rows(rows, keys + d, stride, span.tokens, size);  // values
@@ -1297,8 +1334,8 @@ struct AttentionPass {
             T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
             const T* const factor = factors + head_at(i, h);
             // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
-            dot_rows<Width>(dw, out.grad() + i * d + column, rows, seen, size, T(1));
-            for (int j = 0; j < seen; ++j) dw[j] *= factor[j];
+            const T* const d_out = out.grad() + i * d + column;
+            for (int j = 0; j < seen; ++j) dw[j] = dot<Width>(d_out, rows + j * size, size) * factor[j];
             const T mean = dot<Width>(w, dw, seen);
             for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
             for (int j = 0; j < seen; ++j) w[j] *= factor[j];  // from here on after dropout
@@ -1502,30 +1539,28 @@ struct Transformer {
                 "least one of each dimension, no more action dimensions than its width, %d, and dropout in [0, 1)",
                 c.state_dim, c.action_dim, c.max_timesteps, static_cast<double>(c.dropout), d);
         parameters.reserve(20 + 12 * static_cast<size_t>(c.layers));  // tensors point to them
-        embed_return = linear_layer("embed_return", 1, d, Init::uniform_fan_in, seed);
-        embed_state = linear_layer("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
-        embed_action = linear_layer("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);
+        embed_return = affine("embed_return", 1, d, Init::uniform_fan_in, seed);
+        embed_state = affine("embed_state", c.state_dim, d, Init::uniform_fan_in, seed);
+        embed_action = affine("embed_action", c.action_dim, d, Init::uniform_fan_in, seed);
         embed_ln = norm("embed_ln", seed);
         for (int layer = 0; layer < c.layers; ++layer) {
             const std::string h = "transformer.h." + std::to_string(layer) + ".";
-            Block block;
+            Block& block = blocks.emplace_back();
             block.ln_1 = norm(h + "ln_1", seed);
-            block.c_attn = conv1d(h + "attn.c_attn", d, 3 * d, seed);
-            block.attn_proj = conv1d(h + "attn.c_proj", d, d, seed);
+            block.c_attn = affine(h + "attn.c_attn", d, 3 * d, Init::normal_002, seed);
+            block.attn_proj = affine(h + "attn.c_proj", d, d, Init::normal_002, seed);
             block.ln_2 = norm(h + "ln_2", seed);
-            block.c_fc = conv1d(h + "mlp.c_fc", d, 4 * d, seed);
-            block.mlp_proj = conv1d(h + "mlp.c_proj", 4 * d, d, seed);
-            blocks.push_back(block);
+            block.c_fc = affine(h + "mlp.c_fc", d, 4 * d, Init::normal_002, seed);
+            block.mlp_proj = affine(h + "mlp.c_proj", 4 * d, d, Init::normal_002, seed);
         }
         ln_f = norm("transformer.ln_f", seed);
-        if (c.head == Head::squashed_gaussian) {
-            predict_mean = linear_layer("predict_action.mu", d, c.action_dim, Init::orthogonal, seed);
-            predict_log_std = linear_layer("predict_action.log_std", d, c.action_dim, Init::orthogonal, seed);
-        } else if (c.head == Head::categorical) {
-            predict_mean = linear_layer("predict_action.logits", d, c.action_dim, Init::orthogonal, seed);
-        } else {
-            predict_mean = linear_layer("predict_action.0", d, c.action_dim, Init::uniform_fan_in, seed);
-        }
+        const bool gaussian = c.head == Head::squashed_gaussian, categorical = c.head == Head::categorical;
+        const char* const output = gaussian      ? "predict_action.mu"
+                                   : categorical ? "predict_action.logits"
+                                                 : "predict_action.0";
+        const Init start = c.head == Head::deterministic ? Init::uniform_fan_in : Init::orthogonal;
+        predict_mean = affine(output, d, c.action_dim, start, seed);
+        if (gaussian) predict_log_std = affine("predict_action.log_std", d, c.action_dim, start, seed);
         // Last, so that having it moves no other tensor's random numbers.
         if (c.max_timesteps > 0)
             embed_ordering = add("embed_ordering.weight", {c.max_timesteps, d}, Init::normal_1, 0, seed);
@@ -1535,25 +1570,18 @@ struct Transformer {
 
   private:
     Tensor<T> add(const std::string& name, const std::vector<int>& shape, Init init, int fan_in, uint32_t seed) {
-        Parameter<T> parameter;
-        parameter.name = name;
-        parameter.shape.assign(shape.begin(), shape.end());
-        size_t size = 1;
-        for (int extent : shape) size *= static_cast<size_t>(extent);
-        parameter.value.resize(size);
-        parameter.gradient.resize(size);
-        initialise(parameter, init, fan_in, seed, parameters.size());
-        parameters.push_back(std::move(parameter));
+        const size_t size = static_cast<size_t>(shape.front()) * (shape.size() > 1 ? shape.back() : 1);
+        parameters.push_back({name, {shape.begin(), shape.end()}, std::vector<T>(size), std::vector<T>(size)});
+        initialise(parameters.back(), init, fan_in, seed, parameters.size() - 1);
         return parameters.back().tensor();
     }
-    Affine<T> linear_layer(const std::string& name, int in, int out, Init init, uint32_t seed) {
-        const Tensor<T> weight = add(name + ".weight", {out, in}, init, in, seed);
-        const Init bias = init == Init::orthogonal ? Init::zeros : init;
-        return {weight, add(name + ".bias", {out}, bias, in, seed), Layout::out_in};
-    }
-    Affine<T> conv1d(const std::string& name, int in, int out, uint32_t seed) {
-        const Tensor<T> weight = add(name + ".weight", {in, out}, Init::normal_002, in, seed);
-        return {weight, add(name + ".bias", {out}, Init::zeros, in, seed), Layout::in_out};
+    // The layout follows from where the layer stands: [in, out] inside the GPT-2 stack, whose weights are normal.
+    Affine<T> affine(const std::string& name, int in, int out, Init init, uint32_t seed) {
+        const bool in_stack = init == Init::normal_002, uniform = init == Init::uniform_fan_in;
+        const std::vector<int> shape = in_stack ? std::vector{in, out} : std::vector{out, in};
+        const Tensor<T> weight = add(name + ".weight", shape, init, in, seed);
+        const Tensor<T> bias = add(name + ".bias", {out}, uniform ? init : Init::zeros, in, seed);
+        return {weight, bias, in_stack ? Layout::in_out : Layout::out_in};
     }
     Norm<T> norm(const std::string& name, uint32_t seed) {
         const Tensor<T> weight = add(name + ".weight", {config.width}, Init::ones, 0, seed);
@@ -1587,24 +1615,19 @@ inline TokenLayout token_layout(const SequenceBatch& batch, Queries queries) {
     return layout;
 }
 
-// Adds the tokens of the named steps, `offset` rows after their R tokens: inputs [steps, columns] through the layer,
-// plus the row of the position table that belongs to the step's time.
+// Adds one kind of token: inputs [rows, layer's inputs] through the layer to the rows `at`, and to each the row of the
+// position table that belongs to its time.
 template <class T>
-void place_tokens(Tape<T>& tape, Tensor<T> tokens, const Transformer<T>& model, const SequenceBatch& batch,
-                  const TokenLayout& layout, const std::vector<int>& steps, int offset,
-                  const std::vector<float>& inputs, int columns, const Affine<T>& layer) {
-    const int count = static_cast<int>(steps.size()), max_timesteps = model.config.max_timesteps;
+void place_tokens(Tape<T>& tape, Tensor<T> tokens, const Transformer<T>& model, const std::vector<int>& at,
+                  const std::vector<int>& times, const std::vector<float>& inputs, const Affine<T>& layer) {
+    const int count = static_cast<int>(at.size());
     if (count == 0) return;
-    std::vector<int> token_rows, position_rows;
-    for (const int step : steps) {
-        token_rows.push_back(layout.step_token[step] + offset);
-        position_rows.push_back(std::min(batch.timesteps[step], max_timesteps - 1));  // ODT clips at the table's end
-    }
-    const int* rows = tape.keep(token_rows);
-    const Tensor<T> embedded = linear(tape, tape.constant(inputs.data(), count, columns), layer);
-    add_rows_by_index(tape, tokens, rows, embedded, nullptr, count);
-    if (max_timesteps == 0) return;
-    add_rows_by_index(tape, tokens, rows, model.embed_ordering, tape.keep(position_rows), count);
+    const int* const rows = tape.keep(at);
+    const int columns = static_cast<int>(inputs.size()) / count;
+    add_rows_by_index(tape, tokens, rows, linear(tape, tape.constant(inputs.data(), count, columns), layer), nullptr,
+                      count);
+    if (model.config.max_timesteps > 0)
+        add_rows_by_index(tape, tokens, rows, model.embed_ordering, tape.keep(times), count);
 }
 
 // The tokens R, s, a of every step, each through its own linear layer, plus the position's row: [tokens, width].
@@ -1614,22 +1637,23 @@ Tensor<T> embed_tokens(Tape<T>& tape, const Transformer<T>& model, const Sequenc
     const ptrdiff_t action_dim = model.config.action_dim;
     const Tensor<T> tokens = tape.make(layout.tokens, model.config.width);
     std::fill_n(tokens.value, tokens.size(), T(0));
-    std::vector<int> every_step(batch.returns_to_go.size()), acted;  // `acted`: steps whose action is a token
-    std::iota(every_step.begin(), every_step.end(), 0);
-    std::vector<float> actions;  // [acted, action_dim]
+    std::vector<int> state_token, action_token, times, action_times;  // rows of tokens, and the times of their steps
+    std::vector<float> actions;                                       // those that are tokens: all but a window's last
     int step = 0;
-    for (const int length : batch.lengths) {
-        for (int c = 0; c + 1 < length; ++c) {
-            acted.push_back(step + c);
-            const auto first = batch.actions.begin() + (step + c) * action_dim;
+    for (const int length : batch.lengths)
+        for (int c = 0; c < length; ++c, ++step) {
+            state_token.push_back(layout.step_token[step] + 1);
+            // ODT clips at the table's end.
+            times.push_back(std::min(batch.timesteps[step], model.config.max_timesteps - 1));
+            if (c + 1 == length) continue;
+            action_token.push_back(layout.step_token[step] + 2);
+            action_times.push_back(times.back());
+            const auto first = batch.actions.begin() + step * action_dim;
             actions.insert(actions.end(), first, first + action_dim);
         }
-        step += length;
-    }
-    const TransformerConfig& config = model.config;
-    place_tokens(tape, tokens, model, batch, layout, every_step, 0, batch.returns_to_go, 1, model.embed_return);
-    place_tokens(tape, tokens, model, batch, layout, every_step, 1, batch.states, config.state_dim, model.embed_state);
-    place_tokens(tape, tokens, model, batch, layout, acted, 2, actions, config.action_dim, model.embed_action);
+    place_tokens(tape, tokens, model, layout.step_token, times, batch.returns_to_go, model.embed_return);
+    place_tokens(tape, tokens, model, state_token, times, batch.states, model.embed_state);
+    place_tokens(tape, tokens, model, action_token, action_times, actions, model.embed_action);
     return tokens;
 }
 

@@ -89,7 +89,7 @@ struct Measurements {
 
 constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
 
-template <class V, bool Fused>
+template <class V, Multiply How>
 ALWAYS_INLINE float burn_vectors(int64_t rounds) {
     V sum[burn_chains], a = 0.999f - V{}, b = 0.001f - V{};
 #pragma GCC unroll 16
@@ -97,10 +97,10 @@ ALWAYS_INLINE float burn_vectors(int64_t rounds) {
     for (int64_t round = 0; round < rounds; ++round) {
 #pragma GCC unroll 16
         for (int i = 0; i < burn_chains; ++i) {
-            if constexpr (Fused)
-                multiply_add<true>(sum[i], a, b);
-            else
+            if constexpr (How == Multiply::plain)
                 sum[i] = sum[i] * a + b;
+            else
+                multiply_add<How>(sum[i], a, b);
         }
 #if defined(__x86_64__)
         asm volatile("" : "+v"(a));  // a might have changed: no product may leave the loop
@@ -114,20 +114,25 @@ ALWAYS_INLINE float burn_vectors(int64_t rounds) {
 
 #ifdef X86_KERNELS
 __attribute__((target("avx512f"))) float burn_avx512(int64_t rounds) {
-    return burn_vectors<Vector<float, 16>, true>(rounds);
+    return burn_vectors<Vector<float, 16>, Multiply::fused>(rounds);
 }
 __attribute__((target("avx2,fma"))) float burn_avx2(int64_t rounds) {
-    return burn_vectors<Vector<float, 8>, true>(rounds);
+    return burn_vectors<Vector<float, 8>, Multiply::fused>(rounds);
+}
+__attribute__((target("arch=x86-64-v4,avx512bf16"))) float burn_bf16(int64_t rounds) {
+    return burn_vectors<Vector<float, 16>, Multiply::bf16>(rounds);
 }
 #endif
 
 // Operations a second of one core in the kernel's own instructions.
 double burn_rate(const Kernel& kernel) {
-    float (*burn)(int64_t) = burn_vectors<Vector<float, 4>, false>;
-    const double operations = 2.0 * burn_chains * kernel.tile_columns / 2;
+    float (*burn)(int64_t) = burn_vectors<Vector<float, 4>, Multiply::plain>;
+    if (&kernel == &kernel_portable_bf16) burn = burn_vectors<Vector<float, 4>, Multiply::bf16_portable>;
+    const double operations = 2.0 * burn_chains * kernel.tile_columns / 2 * kernel.k_a_word;
 #ifdef X86_KERNELS
     if (&kernel == &kernel_avx512) burn = burn_avx512;
     if (&kernel == &kernel_avx2) burn = burn_avx2;
+    if (&kernel == &kernel_avx512_bf16) burn = burn_bf16;
 #endif
     volatile float sink = 0;
     const double rounds = std::max(1.0, 3e8 / operations);

@@ -226,25 +226,39 @@ struct Stored {
     }
 };
 
-// The definition told again, the multiply-add with one rounding or with two; and in double, with its error bound.
+// x to the nearest number of 8 bits of mantissa, of two the even one; for x whose exponent is far from the ends.
+float rounded_to_bf16(float x) {
+    int exponent = 0;
+    const float mantissa = std::frexp(x, &exponent);
+    return std::ldexp(std::nearbyint(std::ldexp(mantissa, 8)), exponent - 8);
+}
+
+// The definition told again, the multiply-add with one rounding or with two, or in pairs of bf16, the odd one first; and
+// in double, with its error bound.
 struct Product {
     float value;
     double exact, bound;
 };
 
 Product product(const float* a, const float* b, int K, int N, float start, const Kernel& kernel) {
-    const bool fused = kernel.arithmetic == std::string("fused");
+    const bool fused = kernel.arithmetic == std::string("fused"), bf16 = kernel.precision == std::string("bf16");
     Product p = {start, start, std::fabs(start)};
     for (int first = 0; first < K; first += 256) {
+        const int end = std::min(K, first + 256);
         float sum = 0;
-        for (int k = first; k < std::min(K, first + 256); ++k) {
-            sum = fused ? std::fma(a[k], b[k * N], sum) : sum + a[k] * b[k * N];
+        for (int k = first; bf16 && k < end + (end - first) % 2; ++k) {
+            const int other = first + ((k - first) ^ 1);  // 1, 0, 3, 2, ...
+            if (other < end) sum = std::fma(rounded_to_bf16(a[other]), rounded_to_bf16(b[other * N]), sum);
+        }
+        for (int k = first; k < end; ++k) {
+            if (!bf16) sum = fused ? std::fma(a[k], b[k * N], sum) : sum + a[k] * b[k * N];
             p.exact += static_cast<double>(a[k]) * b[k * N];
             p.bound += std::fabs(static_cast<double>(a[k]) * b[k * N]);
         }
         p.value += sum;
     }
-    p.bound *= (std::min(K, 256) + (K + 255) / 256 + 1) * unit * 1.001;  // roundings on the way of a product to C
+    const double rounding_of_inputs = bf16 ? 2 * 0x1p-8 + 0x1p-16 : 0;                        // 8 bits of mantissa each
+    p.bound *= rounding_of_inputs + (std::min(K, 256) + (K + 255) / 256 + 1) * unit * 1.001;  // on the way to C
     return p;
 }
 
@@ -271,7 +285,7 @@ void check_matmul(Compute& compute, Draws& draws, int M, int N, int K) {
                 const Store how = store == 0 ? Store::overwrite : Store::accumulate;
                 matmul(compute, View<float>{c.data(), N + 3}, stored_a.view, stored_b.view, M, N, K, how);
                 bool same = same_bits(c, expected[store]);
-                if (compute.kernel.arithmetic != std::string("fused")) {
+                if (compute.kernel.arithmetic == std::string("plain")) {
                     const View<float> to = {plain.data(), N + 3};
                     matmul_plain(to, stored_a.view, stored_b.view, M, N, K, how);
                     same = same && same_bits(c, plain);
@@ -393,6 +407,39 @@ TEST(bias_and_relu_are_applied_once_after_the_last_addition) {
     float c = NAN;
     apply_epilogue<float>({&c, 1}, {nullptr, true}, {0, 1, 0, 1});
     CHECK(std::isnan(c));
+}
+
+// vdpbf16ps against its definition, on all kinds of numbers: subnormal, zero, infinite, NaN, sums that cancel or overflow.
+TEST(bf16_kernels_have_the_same_bits_on_all_kinds_of_numbers) {
+    Draws draws = {25};
+    const Random random = {test_seed(), 1002};
+    const float special[] = {0.0f,       -0.0f,         0x1p-133f,     -0x1.fp-127f, 0x1p-126f, 0x1p-64f,
+                             0x1.8p-63f, 1.0f,          -0x1.01p0f,    0x1.fep127f,  INFINITY,  -INFINITY,
+                             NAN,        0x1.ffffp127f, 0x1.00ffffp0f, 0x1.018p0f};
+    constexpr int size = 48, depth = 6;
+    std::vector<const Kernel*> found;
+    for (const Kernel* kernel : kernels_of_this_machine())
+        if (kernel->precision == std::string("bf16")) found.push_back(kernel);
+    for (uint32_t round = 0; round < 200; ++round) {
+        std::vector<float> a, b;
+        for (uint32_t i = 0; i < size * depth; ++i) {
+            const bool chosen = random.below(4, round, i) == 0;
+            a.push_back(chosen ? special[random.below(16, round, i, 1)]
+                               : static_cast<float>(draws.normal()) * 0x1p-63f);
+            b.push_back(chosen ? static_cast<float>(draws.normal()) : special[random.below(9, round, i, 2)]);
+        }
+        std::vector<float> first;
+        for (const Kernel* kernel : found) {
+            Compute compute(*kernel, 1);
+            std::vector<float> c(size * size);
+            matmul(compute, View<float>{c.data(), size}, {a.data(), depth}, {b.data(), size}, size, size, depth,
+                   Store::overwrite);
+            for (float& x : c)
+                if (std::isnan(x)) x = 7;  // a NaN's payload is not part of the definition
+            if (first.empty()) first = c;
+            CHECK(same_bits(c, first));
+        }
+    }
 }
 
 TEST(the_best_kernel_is_the_first_that_the_machine_supports) {
@@ -875,25 +922,18 @@ TEST(attention_equals_attention_plain) {
     }
 }
 
-TEST(dots_add_in_the_order_that_they_say_alone_by_fours_and_in_both_widths) {
+TEST(dot_adds_in_the_order_that_it_says_in_both_widths) {
     Draws draws = {16};
     for (size_t n = 0; n < 70; ++n) {
-        const std::vector<float> x = draws.normals<float>(n), rows = draws.normals<float>(4 * n);
-        float by_16[4], by_8[4];
-        const ptrdiff_t stride = static_cast<ptrdiff_t>(n);
-        dots<4, 16>(by_16, x.data(), rows.data(), stride, stride);
-        dots<4, 8>(by_8, x.data(), rows.data(), stride, stride);
-        for (size_t r = 0; r < 4; ++r) {
-            const float* row = rows.data() + r * n;
-            float lane[16] = {}, rest = 0;
-            for (size_t i = 0; i < n / 16 * 16; ++i) lane[i % 16] += x[i] * row[i];
-            for (size_t i = n / 16 * 16; i < n; ++i) rest += x[i] * row[i];
-            for (size_t width = 8; width > 0; width /= 2)
-                for (size_t i = 0; i < width; ++i) lane[i] += lane[i + width];
-            CHECK_EQUAL(by_16[r], lane[0] + rest);
-            CHECK_EQUAL(by_8[r], lane[0] + rest);
-            CHECK_EQUAL(dot(x.data(), row, static_cast<int>(n)), lane[0] + rest);
-        }
+        const std::vector<float> x = draws.normals<float>(n), y = draws.normals<float>(n);
+        float lane[16] = {}, rest = 0;
+        for (size_t i = 0; i < n / 16 * 16; ++i) lane[i % 16] += x[i] * y[i];
+        for (size_t i = n / 16 * 16; i < n; ++i) rest += x[i] * y[i];
+        for (size_t width = 8; width > 0; width /= 2)
+            for (size_t i = 0; i < width; ++i) lane[i] += lane[i + width];
+        const float by_16 = dot<16>(x.data(), y.data(), static_cast<ptrdiff_t>(n));
+        CHECK_EQUAL(by_16, lane[0] + rest);
+        CHECK_EQUAL(dot(x.data(), y.data(), static_cast<ptrdiff_t>(n)), lane[0] + rest);
     }
 }
 
