@@ -149,6 +149,10 @@ struct Random {
 // ---------------------------------------------------------------------------------------------------------------------
 // Threads. A fixed set of workers that share out numbered tasks. Which worker runs a task is left to chance; what a
 // task computes must depend on its number alone, so that results are the same for any number of threads.
+//
+// A job: run() publishes f and the number of tasks under the lock and wakes the workers; everyone, the caller included,
+// takes the next task number until none is left; who finishes the last task wakes the caller. A worker that wakes late
+// finds no task and sleeps again, so the caller never waits for a worker that has nothing to do.
 
 class Threads {
   public:
@@ -505,7 +509,7 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_line, 
     }
 }
 
-// PackFunction for bf16: the panel is [depth / 2, Width] words, of k and k + 1; where depth is odd, the last has one zero.
+// PackFunction for bf16: the panel is [depth / 2, Width] words, of k and k + 1; if depth is odd, the last has one zero.
 template <int Width>
 ALWAYS_INLINE void pack_bf16(void* to, View<const float> view, int first_k, int first_line, int depth, int used) {
     const auto word = [](float even, float odd) { return std::bit_cast<float>(to_bf16(even) | to_bf16(odd) << 16); };
@@ -589,6 +593,13 @@ inline const Kernel& best_kernel() {
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Products from tiles: packing and sharing out.
+//
+//     for 256 values of k at a time:           B [256, N] packed in panels of tile_columns     by all threads
+//         for each block of rows of C:         A [192, 256] packed in panels of tile_rows      one thread a block
+//             for each panel of B, of A:       one tile of C                                   the kernel
+//
+// A tile's sums stay in registers for 256 steps of k; the block of A fits in a core's second cache and is read once for
+// each panel of B, and the panel of B, in the first cache, once for each panel of A.
 
 // Scratch memory on cache lines (a vector load that straddles two costs two). It grows to the largest size asked for;
 // its contents last until room() is called again.
@@ -756,9 +767,9 @@ inline void matmul(Compute& compute, View<double> c, View<const double> a, View<
 // ---------------------------------------------------------------------------------------------------------------------
 // Dot products.
 
-// a . b, of [n] each. The order of additions is part of the definition: lane l of 16 sums the products l, l + 16, ... in
-// order; the lanes are folded in halves (lane l with l + 8, then with l + 4, l + 2, l + 1); the products beyond the last
-// whole 16 are summed in order and added at the end. In a single chain each addition would wait for the one before.
+// a . b, of [n] each. The order of additions is part of the definition: lane l of 16 sums the products l, l + 16, ...
+// in order; the lanes are folded in halves (lane l with l + 8, then with l + 4, l + 2, l + 1); the products beyond the
+// last whole 16 are summed in order and added at the end. In a single chain each addition would wait for the one before.
 // Width: how many lanes a vector has.
 template <int Width = 8, class T>
 ALWAYS_INLINE T dot(const T* a, const T* b, ptrdiff_t n) {
@@ -782,6 +793,10 @@ ALWAYS_INLINE T dot(const T* a, const T* b, ptrdiff_t n) {
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Tensors and the tape. Templated on the scalar: float trains, double serves the checks against finite differences.
+//
+// Reverse-mode differentiation. Each operation computes its result at once and records a step that turns
+// dy = d(loss)/d(result) into its share of dx = d(loss)/d(x) for each input x: dx += (dy/dx)^T dy. backward() runs the
+// steps from the last operation to the first, so that dy is complete before it is passed on.
 
 template <class T>
 struct Tape;
@@ -814,7 +829,7 @@ class Arena {
         std::unique_ptr<Buffer::Line[]> lines;
         size_t bytes;
     };
-    // Each chunk doubles the memory; `new` without parentheses leaves it uninitialised, and what is never used costs none.
+    // Each chunk doubles the memory; `new` without parentheses leaves it uninitialised, and unused pages cost nothing.
     void add_chunk(size_t bytes) {
         total_ += bytes;
         chunks_.push_back({std::unique_ptr<Buffer::Line[]>(new Buffer::Line[bytes / sizeof(Buffer::Line)]), bytes});
@@ -823,8 +838,8 @@ class Arena {
     size_t chunk_ = 0, used_ = 0, total_ = 0;
 };
 
-// d(loss)/d(a tensor), accumulated. Its memory is taken at the first addition, which overwrites it and so saves a pass of
-// zeros, and given back after the last backward step that reads it: at any time few gradients are alive.
+// d(loss)/d(a tensor), accumulated. Its memory is taken at the first addition, which overwrites it and so saves a pass
+// of zeros, and given back after the last backward step that reads it: at any time few gradients are alive.
 template <class T>
 struct Gradient {
     T* data = nullptr;        // [rows, columns]; null before the first addition
@@ -1095,6 +1110,10 @@ struct Norm {
 };
 
 // LayerNorm over the columns of x [n, d]: y = (x - mean) / sqrt(variance + 1e-5) * weight + bias, variance with 1/d.
+//
+// Backward, for each row: with n = (x - mean) * scale, scale = 1 / sqrt(variance + 1e-5), and g = dy * weight,
+//     dx = (g - mean(g) - n * mean(g * n)) * scale      the mean and the variance depend on x, too
+//     d_weight += dy * n        d_bias += dy            summed over rows
 template <class T>
 Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
     const int d = x.columns;
@@ -1122,7 +1141,6 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
         const Store store = next_store(x);
         const T* const d_out = y.grad();
         T* const d_in = x.grad();
-        // With n = (x - mean) * scale, g = dy * weight: dx = (g - mean(g) - n * mean(g * n)) * scale.
         // A block's sums [4, d]: d_weight, d_bias, and room for a row's g and n beside them in the cache.
         const T* sums = block_sums<T>(compute, x.rows, 4 * d, [=](auto lanes, ptrdiff_t row, T* sum) INLINE_LAMBDA {
             const T *in = x.value + row * d, *dy = d_out + row * d;
@@ -1271,7 +1289,7 @@ void gather_rows(T* to, const T* rows, ptrdiff_t stride, ptrdiff_t n, ptrdiff_t 
     for (ptrdiff_t j = 0; j < n; ++j) std::copy_n(rows + j * stride, size, to + j * size);
 }
 
-// softmax of x [n], in place, without overflow.
+// softmax of x [n], in place: the largest is subtracted from each x first, so that no exponential overflows.
 template <class T>
 void softmax(T* x, int n) {
     const T largest = *std::max_element(x, x + n);
@@ -1289,7 +1307,15 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// What attention's two passes work on, one (sequence, head) at a time.
+// What attention's two passes work on, one (sequence, head) at a time. With queries q_i, keys k_j, values v_j of one
+// head, m_ij its dropout factors and j running over the tokens up to i's:
+//
+//     s_ij = q_i . k_j / sqrt(size)        w_i = softmax(s_i)        out_i = sum_j m_ij w_ij v_j
+//
+// and backward, from d_out_i:
+//
+//     d_v_j = sum_i m_ij w_ij d_out_i      d_w_ij = m_ij v_j . d_out_i      d_s_ij = w_ij (d_w_ij - sum_m w_im d_w_im)
+//     d_q_i = sum_j d_s_ij k_j / sqrt(size)                                 d_k_j = sum_i d_s_ij q_i / sqrt(size)
 template <class T>
 struct AttentionPass {
     Tensor<T> q, kv, out;
@@ -1333,19 +1359,19 @@ struct AttentionPass {
             const int seen = seen_by(i, span);
             T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
             const T* const factor = factors + head_at(i, h);
-            // dw_j = factor_j v_j . d_out; through the softmax, d_score_j = w_j (dw_j - sum_m w_m dw_m).
+            // dw becomes d_s / sqrt(size), w the weights after dropout: what the sums below need.
             const T* const d_out = out.grad() + i * d + column;
             for (int j = 0; j < seen; ++j) dw[j] = dot<Width>(d_out, rows + j * size, size) * factor[j];
             const T mean = dot<Width>(w, dw, seen);
             for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
-            for (int j = 0; j < seen; ++j) w[j] *= factor[j];  // from here on after dropout
+            for (int j = 0; j < seen; ++j) w[j] *= factor[j];
         }
-        // d_q_i = sum over the keys j that i sees of d_score_ij k_j.
+        // d_q_i: a sum over the keys that i sees.
         gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
         for (ptrdiff_t i = first; i < end; ++i)
             add_weighted_rows<Width>(q.grad() + i * q.columns + column, d_weights + head_at(i, h), 1, rows,
                                      seen_by(i, span), size, to_q);
-        // d_k_j = sum over the queries i that see j of d_score_ij q_i; d_v_j = sum of factor_ij w_ij d_out_i.
+        // d_k_j and d_v_j: sums over the queries that see j.
         gather_rows(rows, q.value + first * q.columns + column, q.columns, span.queries, size);
         add_to_keys<Width>(kv.grad() + first_key, d_weights, span, h, rows, to_kv);
         gather_rows(rows, out.grad() + first * d + column, d, span.queries, size);
@@ -1414,7 +1440,8 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span*
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Parameters by name, and how each kind starts.
+// Parameters by name, and how each kind starts: the distributions of ODT's code, where GPT-2's are those of the
+// transformers library, a Linear's those of PyTorch, and the policy's output layers are orthogonal.
 
 enum class Init {
     zeros,
@@ -1589,7 +1616,12 @@ struct Transformer {
     }
 };
 
-// Where each token of a packed batch lies, and which tokens are queries.
+// Where each token of a packed batch lies, and which tokens are queries. Windows of 2 steps and 1 step, say:
+//
+//     row       0    1    2    3    4     5    6
+//     token     R_0  s_0  a_0  R_1  s_1   R_0  s_0      the last action of a window is no token
+//     sees      0    0-1  0-2  0-3  0-4   5    5-6      its own window, up to and with itself
+//     query          x              x          x        every_state; with last_state rows 4 and 6 alone
 struct TokenLayout {
     int tokens = 0;
     std::vector<Span> all_spans, query_spans;   // one per window; its queries: all its tokens, or the layout's queries
@@ -1597,6 +1629,7 @@ struct TokenLayout {
     std::vector<int> step_token;                // [n] row of a step's R token; s and a follow
 };
 
+// The layout of a batch's windows, one after the other.
 inline TokenLayout token_layout(const SequenceBatch& batch, Queries queries) {
     TokenLayout layout;
     for (const int length : batch.lengths) {
@@ -1714,7 +1747,8 @@ Tensor<T> tanh_of(Tape<T>& tape, Tensor<T> x) {
         tape, x, [](T u) { return std::tanh(u); }, [](T, T y) { return T(1) - y * y; });
 }
 
-// log of the softmax of each row of the logits, [n, actions].
+// log of the softmax of each row of the logits, [n, actions]: y_j = x_j - log sum_m exp(x_m), with the largest x
+// subtracted first. Backward: dx_j += dy_j - exp(y_j) sum_m dy_m.
 template <class T>
 Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
     const Tensor<T> y = tape.make(logits.rows, logits.columns);
@@ -1770,7 +1804,7 @@ T softplus(T x) {
     return std::max(x, T(0)) + std::log1p(std::exp(-std::abs(x)));
 }
 
-// log |d tanh(u) / du| = log(1 - tanh(u)^2), exact also where tanh rounds to 1.
+// log |d tanh(u) / du| = log(1 - tanh(u)^2) = 2 (log 2 - u - log(1 + exp(-2 u))), exact also where tanh rounds to 1.
 template <class T>
 T log_tanh_slope(T u) {
     return T(2) * (T(0.69314718055994531) - u - softplus(T(-2) * u));
@@ -1901,7 +1935,13 @@ Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Optimisers. One struct: LAMB and AdamW differ in where the weight decay goes and in the trust ratio; Adam is AdamW
-// without decay.
+// without decay. For update t = 1, 2, ... of a tensor theta with gradient g, weight decay c and learning rate r:
+//
+//     g <- g min(1, clip_norm / (|g| of all tensors + 1e-6))
+//     m <- beta1 m + (1 - beta1) g          v <- beta2 v + (1 - beta2) g^2
+//     u = (m / (1 - beta1^t)) / (sqrt(v / (1 - beta2^t)) + epsilon)
+//     LAMB    u <- u + c theta;    theta <- theta - r (|theta| / |u|) u        You et al., ICLR 2020
+//     AdamW                        theta <- (1 - r c) theta - r u              Loshchilov and Hutter, ICLR 2019
 
 struct OptimizerConfig {
     enum class Rule { lamb, adamw } rule = Rule::lamb;
