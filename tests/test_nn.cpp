@@ -409,6 +409,14 @@ TEST(bias_and_relu_are_applied_once_after_the_last_addition) {
     CHECK(std::isnan(c));
 }
 
+TEST(bf16_rounds_to_the_nearest_and_of_two_to_the_even_one) {
+    const std::pair<float, uint32_t> cases[] = {
+        {1.0f, 0x3f80},        {0x1.01p0f, 0x3f80}, {0x1.03p0f, 0x3f82}, {0x1.0102p0f, 0x3f81}, {-0x1.03p0f, 0xbf82},
+        {0x1.ffp127f, 0x7f80}, {INFINITY, 0x7f80},  {0.0f, 0},           {-0.0f, 0x8000}};
+    for (const auto& [x, bits] : cases) CHECK_EQUAL(to_bf16(x), bits);
+    CHECK(std::isnan(std::bit_cast<float>(to_bf16(std::bit_cast<float>(0x7f800001)) << 16)));
+}
+
 // vdpbf16ps against its definition, on all kinds of numbers: subnormal, zero, infinite, NaN, sums that cancel or overflow.
 TEST(bf16_kernels_have_the_same_bits_on_all_kinds_of_numbers) {
     Draws draws = {25};
