@@ -323,17 +323,19 @@ struct Inflater {
     }
 };
 
-// Fills `out`, which must have the exact size of the data. Errors: hdf5.deflate with what was found.
-inline void inflate_zlib(Bytes in, std::span<uint8_t> out) {
+// Returns the data, which must be `size` bytes. Errors: hdf5.deflate with what was found.
+inline std::vector<uint8_t> inflate_zlib(Bytes in, size_t size) {
     const bool header = in.size() >= 6 && (in[0] & 15) == 8 && in[0] >> 4 <= 7 && (in[0] << 8 | in[1]) % 31 == 0;
     if (!header || (in[1] & 32) != 0) bad_stream("no zlib header");  // 32: with a dictionary
+    std::vector<uint8_t> out(size);
     const BitReader source{in.data() + 2, in.data() + in.size() - 4};
     const auto state = std::make_unique<Inflater>(source, out);  // 128 kB
     state->run();
-    if (state->done != out.size()) bad_stream("less data than the chunk holds");
+    if (state->done != size) bad_stream("less data than the chunk holds");
     if (state->source.in != source.in_end) bad_stream("bytes after the end of the compressed data");
     if (__builtin_bswap32(static_cast<uint32_t>(little_endian(in.last(4)))) != adler32(out))
         bad_stream("data that does not match its Adler-32 checksum");
+    return out;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -377,14 +379,8 @@ struct Hdf5Chunk {
 
 enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
 
-// All chunks of a data set have the same extents. Here shape (4, 5), chunks of (2, 2), counts (2, 3); the last ones
-// hang over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
-//
-//   +-------+-------+---+---+
-//   | chunk | chunk | ch|unk|      place 0, 1, 2
-//   +-------+-------+---+---+
-//   | chunk | chunk | ch|unk|      place 3, 4, 5
-//   +-------+-------+---+---+
+// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has counts (2, 3); the last chunk of
+// each row hangs over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
 struct Hdf5Dataset {
     std::string path;         // "infos/qpos": no slash at the start
     Shape shape;              // {}: a scalar
@@ -464,12 +460,8 @@ struct Hdf5File {
                     size -= 4;
                     continue;
                 }
-                std::vector<uint8_t> out(size);
-                if (filters[i] == Hdf5Filter::deflate)
-                    inflate_zlib(data, out);
-                else
-                    unshuffle(data, dataset.element.size, out);
-                buffer.swap(out);
+                buffer = filters[i] == Hdf5Filter::deflate ? inflate_zlib(data, size)
+                                                           : unshuffled(data, dataset.element.size);
                 data = buffer;
             }
             if (data.size() != size) throw Error("hdf5.format", "a chunk of another size than the others");
@@ -490,11 +482,12 @@ struct Hdf5File {
     }
 
     // Shuffled data are byte 0 of all elements, then byte 1 of all, ...; a rest below one element stays in place.
-    static void unshuffle(Bytes data, size_t width, std::vector<uint8_t>& out) {
-        out.assign(data.begin(), data.end());
+    static std::vector<uint8_t> unshuffled(Bytes data, size_t width) {
+        std::vector<uint8_t> out(data.begin(), data.end());
         const size_t count = data.size() / width;
         for (size_t j = 0; j < width; ++j)
             for (size_t k = 0; k < count; ++k) out[k * width + j] = data[j * count + k];
+        return out;
     }
 
     // Converts the part of a chunk that lies within the data set, row after row of the last dimension.
@@ -561,12 +554,6 @@ struct Hdf5Parser {
         if (n > budget) damaged("hdf5.cycle", offset, "an end: structures refer to each other in a circle");
         budget -= n;
     }
-    // Returns a part of the file; structures are read through here alone.
-    Bytes bytes(uint64_t offset, uint64_t n) {
-        require_inside(offset, n);
-        charge(offset, n);
-        return file.bytes.subspan(offset, n);
-    }
     uint64_t product(uint64_t a, uint64_t b, uint64_t offset) const {
         uint64_t result;
         if (__builtin_mul_overflow(a, b, &result)) damaged("hdf5.too_large", offset, "a size of at most 64 bits");
@@ -575,7 +562,7 @@ struct Hdf5Parser {
     static uint64_t quotient(uint64_t a, uint64_t b) { return a / b + (a % b != 0 ? 1 : 0); }  // rounded up
     static uint64_t log2(uint64_t value) { return static_cast<uint64_t>(std::bit_width(value)) - 1; }
 
-    // Reads one field after the other from [at, end).
+    // Reads one field after the other from [at, end), which lies in the file.
     struct Cursor {
         Hdf5Parser& parser;
         uint64_t at, end;
@@ -584,8 +571,9 @@ struct Hdf5Parser {
         Bytes take(uint64_t n) {
             if (n > end - at)
                 parser.damaged("hdf5.truncated", at, std::to_string(n) + " bytes before " + std::to_string(end));
+            parser.charge(at, n);
             at += n;
-            return parser.bytes(at - n, n);
+            return parser.file.bytes.subspan(at - n, n);
         }
         uint64_t number(uint64_t size) { return little_endian(take(size)); }
         // Returns the next fields, given their sizes in bytes; one of more than 8 bytes is not needed here.
@@ -596,13 +584,11 @@ struct Hdf5Parser {
         void expect(bool holds, std::string_view what, const char* id = "hdf5.format") const {
             if (!holds) parser.damaged(id, start, what);
         }
-        void signature(std::string_view letters) {
+        void begins(std::string_view letters, std::optional<uint64_t> version) {
             const Bytes found = take(letters.size());
             expect(std::ranges::equal(found, as_bytes(letters)), "the signature " + std::string(letters));
-        }
-        void begins(std::string_view letters, uint64_t version) {
-            signature(letters);
-            expect(number(1) == version, "the byte " + std::to_string(version) + " after " + std::string(letters));
+            if (!version) return;
+            expect(number(1) == *version, "the byte " + std::to_string(*version) + " after " + std::string(letters));
         }
         // Bytes `start` to here are covered by the checksum that follows.
         void checksum() {
@@ -668,7 +654,7 @@ struct Hdf5Parser {
         std::vector<Cursor> blocks;
         uint64_t type_size = 2, rest = 3;  // bytes of the type, and between flags and data
         Cursor c = cursor(address);
-        const bool old = bytes(address, 1)[0] == 1;
+        const bool old = cursor(address, 1).number(1) == 1;
         if (old) {
             const auto [counts, size, reserved] = c.fields(8, 4, 4);
             blocks.push_back(cursor(c.at, size));
@@ -701,7 +687,7 @@ struct Hdf5Parser {
         Cursor block = cursor(address, length);
         if (old) return block;
         block.expect(length >= 8, "a continuation block of at least 8 bytes");
-        block.signature("OCHK");
+        block.begins("OCHK", {});
         return block.checked(length - 8);
     }
 
@@ -760,7 +746,7 @@ struct Hdf5Parser {
         Cursor heap = cursor(heap_address);
         heap.begins("HEAP", 0);
         const auto [reserved, size, free, segment] = heap.fields(3, 8, 8, 8);
-        const Bytes names = bytes(segment, size);
+        const Bytes names = cursor(segment, size).take(size);
         b_tree_1(tree, 0, 8, [&](Cursor, uint64_t node) {
             Cursor c = cursor(node);
             c.begins("SNOD", 1);
@@ -860,7 +846,7 @@ struct Hdf5Parser {
         const auto direct = [&](uint64_t at, uint64_t size, uint64_t offset) {
             Cursor block = cursor(at, size);
             begin(block, "FHDB", offset);
-            const Bytes all = bytes(at, size);
+            const Bytes all = cursor(at, size).take(size);
             if ((flags & 2) != 0) {  // direct blocks have a checksum, which is taken with zeros in its own place
                 const uint64_t stored = block.number(4);
                 std::vector<uint8_t> covered(all.begin(), all.end());
@@ -1084,6 +1070,9 @@ struct Hdf5Parser {
         return total;
     }
 
+    // The indexes of chunks (SPEC VII; III.A.1, node type 1; III.A.2, types 10 and 11).
+    //   B-tree 1   a key: the chunk's size 4, skipped filters 4, its first element 8 each
+    //   B-tree 2   a record: an entry (see index_entry), then the chunk's place 8 each
     void chunked(Grid& g, Cursor c, uint64_t version) {
         Hdf5Dataset& d = g.d;
         const size_t rank = d.shape.size();
@@ -1102,35 +1091,41 @@ struct Hdf5Parser {
         bounded(g.all, d.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
         if (d.elements == 0) return;
+        Shape place(rank);
+        if (version == 3 && tree == undefined_address) return;
         if (version == 3)
-            b_tree_1_index(g, tree);
-        else
-            chunk_index(g, c, (flags & 2) != 0);
-    }
-
-    // SPEC VII. `filtered` matters for a single chunk alone; the parameters of the others are repeated in the index.
-    void chunk_index(Grid& g, Cursor c, bool filtered) {
-        const size_t rank = g.d.shape.size();
+            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t chunk) {
+                const auto [size, skipped] = key.fields(4, 4);
+                for (size_t k = 0; k < rank; ++k) {
+                    const uint64_t first = key.number(8);
+                    key.expect(first % d.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
+                    place[k] = first / d.chunk[k];
+                }
+                add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
+            });
         const uint64_t index = c.number(1);
         c.expect(index >= 1 && index <= 5, "a chunk index of type 1 to 5");
-        Hdf5Chunk single{0, g.d.chunk_bytes, 0, 0};
-        if (index == 1 && filtered) {
-            single.size = c.number(8);
-            single.skipped = static_cast<uint32_t>(c.number(4));
-        }
+        const bool alone = index == 1 && (flags & 2) != 0;  // a filtered chunk; other indexes repeat their parameters
+        const auto [stored, skipped] = c.fields(alone ? 8 : 0, alone ? 4 : 0);
         constexpr uint64_t parameters[] = {0, 0, 0, 1, 5, 6};  // bytes, by index type
         c.take(parameters[index]);
-        single.address = c.number(8);
-        if (single.address == undefined_address) return;
-        if (index == 1) return add(g, Shape(rank, 0), single, c.start);
-        if (index == 5) return b_tree_2_index(g, single.address);
+        const uint64_t address = c.number(8);
+        if (address == undefined_address) return;
+        if (index == 1)
+            return add(g, place, {address, alone ? stored : d.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
+        if (index == 5)
+            return b_tree_2(address, d.filters.empty() ? 10 : 11, [&](Cursor record) {
+                const Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
+                for (uint64_t& coordinate : place) coordinate = record.number(8);
+                add(g, place, chunk, record.start);
+            });
         for (size_t k = 0; k < rank; ++k)
             g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
         g.step.assign(rank, 1);
         for (size_t k = rank; k-- > 1;)
-            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.d.chunk[g.order[k]]), c.at);
-        if (index == 2) return implicit_index(g, single.address);
-        index == 3 ? fixed_array(g, single.address) : extensible_array(g, single.address);
+            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], d.chunk[g.order[k]]), c.at);
+        if (index == 2) return implicit_index(g, address);
+        index == 3 ? fixed_array(g, address) : extensible_array(g, address);
     }
 
     // `place`: which chunk, in each dimension. Those beyond the edge are left over from when the data set was larger.
@@ -1148,31 +1143,6 @@ struct Hdf5Parser {
         charge(offset, sizeof chunk);
         g.d.chunks.push_back(chunk);
         g.d.stored += chunk.size;
-    }
-
-    // SPEC III.A.1, node type 1. A key: the chunk's size 4, skipped filters 4, its first element 8 each.
-    void b_tree_1_index(Grid& g, uint64_t address) {
-        Shape place(g.d.shape.size());
-        if (address == undefined_address) return;
-        b_tree_1(address, 1, 16 + 8 * place.size(), [&](Cursor key, uint64_t chunk) {
-            const auto [size, skipped] = key.fields(4, 4);
-            for (size_t k = 0; k < place.size(); ++k) {
-                const uint64_t first = key.number(8);
-                key.expect(first % g.d.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
-                place[k] = first / g.d.chunk[k];
-            }
-            add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
-        });
-    }
-
-    // SPEC VII.E; III.A.2, types 10 and 11. A record: an entry as below, then the chunk's place 8 each.
-    void b_tree_2_index(Grid& g, uint64_t address) {
-        Shape place(g.d.shape.size());
-        b_tree_2(address, g.d.filters.empty() ? 10 : 11, [&](Cursor c) {
-            const Hdf5Chunk chunk = index_entry(g, c, c.end - c.at - 8 * place.size());
-            for (uint64_t& coordinate : place) coordinate = c.number(8);
-            add(g, place, chunk, c.start);
-        });
     }
 
     // An entry of an index has `size` bytes: address 8, and with filters the chunk's size 1..8 and those skipped 4.
