@@ -263,10 +263,10 @@ struct Inflater {
             const uint32_t symbol = source.decode(symbols);
             if (symbol == 16 && lengths.empty()) bad_stream("a repeated code length before the first");
             const auto value = static_cast<uint8_t>(symbol < 16 ? symbol : symbol == 16 ? lengths.back() : 0);
-            size_t times = 1;
-            if (symbol == 16) times = 3 + source.take(2);
-            if (symbol == 17) times = 3 + source.take(3);
-            if (symbol == 18) times = 11 + source.take(7);
+            const size_t times = symbol < 16    ? 1
+                                 : symbol == 16 ? 3 + source.take(2)
+                                 : symbol == 17 ? 3 + source.take(3)
+                                                : 11 + source.take(7);
             lengths.insert(lengths.end(), times, value);
         }
         if (lengths.size() > n_symbols + n_distances) bad_stream("more code lengths than codes");
@@ -305,18 +305,15 @@ struct Inflater {
     }
 
     void run() {
-        bool last = false;
-        while (!last) {
+        for (bool last = false; !last;) {
             source.refill();
             last = source.take(1) == 1;
             const uint32_t type = source.take(2);
+            if (type == 0) stored();
+            if (type == 1) fixed_codes();
+            if (type == 2) read_codes();
             if (type == 3) bad_stream("a block of type 3");
-            if (type == 0) {
-                stored();
-                continue;
-            }
-            type == 1 ? fixed_codes() : read_codes();
-            compressed();
+            if (type > 0) compressed();
         }
         if (source.count < 0) bad_stream("the end of the compressed data");
         source.in -= source.count / 8;
@@ -446,25 +443,20 @@ struct Hdf5File {
     // Returns the chunk_bytes bytes of a chunk, its filters undone from the last to the first (SPEC IV.A.2.l). They lie
     // in the file or in the buffer.
     Bytes decode(const Hdf5Dataset& dataset, const Hdf5Chunk& chunk, std::vector<uint8_t>& buffer) const {
-        const std::vector<Hdf5Filter>& filters = dataset.filters;
-        const auto applied = [&](size_t i) { return (chunk.skipped >> i & 1) == 0; };
-        size_t size = dataset.chunk_bytes;  // before the filters that are not undone yet
-        for (size_t i = 0; i < filters.size(); ++i)
-            if (filters[i] == Hdf5Filter::fletcher && applied(i)) size += 4;
+        std::vector<Hdf5Filter> filters;  // that were applied
+        for (size_t i = 0; i < dataset.filters.size(); ++i)
+            if ((chunk.skipped >> i & 1) == 0) filters.push_back(dataset.filters[i]);
+        size_t sums = std::ranges::count(filters, Hdf5Filter::fletcher);  // that are still to be taken off
         Bytes data = bytes.subspan(chunk.address, chunk.size);
         try {
-            for (size_t i = filters.size(); i-- > 0;) {
-                if (!applied(i)) continue;
-                if (filters[i] == Hdf5Filter::fletcher) {
-                    data = without_checksum(data);
-                    size -= 4;
-                    continue;
-                }
-                buffer = filters[i] == Hdf5Filter::deflate ? inflate_zlib(data, size)
-                                                           : unshuffled(data, dataset.element.size);
-                data = buffer;
+            for (const Hdf5Filter filter : std::views::reverse(filters)) {
+                if (filter == Hdf5Filter::deflate) buffer = inflate_zlib(data, dataset.chunk_bytes + 4 * sums);
+                if (filter == Hdf5Filter::shuffle) buffer = unshuffled(data, dataset.element.size);
+                data = filter == Hdf5Filter::fletcher ? without_checksum(data) : buffer;
+                sums -= filter == Hdf5Filter::fletcher;
             }
-            if (data.size() != size) throw Error("hdf5.format", "a chunk of another size than the others");
+            if (data.size() != dataset.chunk_bytes)
+                throw Error("hdf5.format", "a chunk of another size than the others");
         } catch (const Error& error) {
             fail_dataset(error.id.c_str(), path, dataset.path,
                          "chunk at offset " + std::to_string(chunk.address) + ": found " + error.what() +
@@ -584,11 +576,9 @@ struct Hdf5Parser {
         void expect(bool holds, std::string_view what, const char* id = "hdf5.format") const {
             if (!holds) parser.damaged(id, start, what);
         }
-        void begins(std::string_view letters, std::optional<uint64_t> version) {
+        void signature(std::string_view letters) {
             const Bytes found = take(letters.size());
             expect(std::ranges::equal(found, as_bytes(letters)), "the signature " + std::string(letters));
-            if (!version) return;
-            expect(number(1) == *version, "the byte " + std::to_string(*version) + " after " + std::string(letters));
         }
         // Bytes `start` to here are covered by the checksum that follows.
         void checksum() {
@@ -608,6 +598,13 @@ struct Hdf5Parser {
     Cursor cursor(uint64_t address, std::optional<uint64_t> size = {}) {
         require_inside(address, size.value_or(0));
         return {*this, address, size ? address + *size : file.bytes.size()};
+    }
+    // Returns a cursor behind the letters and the byte (mostly a version) with which a structure begins.
+    Cursor structure(uint64_t address, const std::string& letters, uint64_t byte, std::optional<uint64_t> size = {}) {
+        Cursor c = cursor(address, size);
+        c.signature(letters);
+        c.expect(c.number(1) == byte, "the byte " + std::to_string(byte) + " after " + letters);
+        return c;
     }
 
     // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...; a user block may come before it.
@@ -653,13 +650,13 @@ struct Hdf5Parser {
         std::vector<Message> out;
         std::vector<Cursor> blocks;
         uint64_t type_size = 2, rest = 3;  // bytes of the type, and between flags and data
-        Cursor c = cursor(address);
+        Cursor first = cursor(address);
         const bool old = cursor(address, 1).number(1) == 1;
         if (old) {
-            const auto [counts, size, reserved] = c.fields(8, 4, 4);
-            blocks.push_back(cursor(c.at, size));
+            const auto [counts, size, reserved] = first.fields(8, 4, 4);
+            blocks.push_back(cursor(first.at, size));
         } else {
-            c.begins("OHDR", 2);
+            Cursor c = structure(address, "OHDR", 2);
             const uint64_t flags = c.number(1);
             c.take(((flags & 32) != 0 ? 16 : 0) + ((flags & 16) != 0 ? 4 : 0));
             type_size = 1;
@@ -687,7 +684,7 @@ struct Hdf5Parser {
         Cursor block = cursor(address, length);
         if (old) return block;
         block.expect(length >= 8, "a continuation block of at least 8 bytes");
-        block.begins("OCHK", {});
+        block.signature("OCHK");
         return block.checked(length - 8);
     }
 
@@ -722,8 +719,7 @@ struct Hdf5Parser {
     static constexpr uint64_t any_level = 256;
     template <class F>
     void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const F& leaf, uint64_t level = any_level) {
-        Cursor c = cursor(address);
-        c.begins("TREE", type);
+        Cursor c = structure(address, "TREE", type);
         const auto [depth, entries, siblings] = c.fields(1, 2, 16);
         c.expect(level == any_level || depth == level, "a node one level below the last");
         for (uint64_t i = 0; i < entries; ++i) {
@@ -743,13 +739,11 @@ struct Hdf5Parser {
     //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 20        (III.B, III.C)
     void symbol_table(Links& links, Cursor message) {
         const auto [tree, heap_address] = message.fields(8, 8);
-        Cursor heap = cursor(heap_address);
-        heap.begins("HEAP", 0);
+        Cursor heap = structure(heap_address, "HEAP", 0);
         const auto [reserved, size, free, segment] = heap.fields(3, 8, 8, 8);
         const Bytes names = cursor(segment, size).take(size);
         b_tree_1(tree, 0, 8, [&](Cursor, uint64_t node) {
-            Cursor c = cursor(node);
-            c.begins("SNOD", 1);
+            Cursor c = structure(node, "SNOD", 1);
             const auto [unused, count] = c.fields(1, 2);
             for (uint64_t n = 0; n < count; ++n) {
                 const auto [name, header, kind, scratch] = c.fields(8, 8, 4, 20);
@@ -779,8 +773,7 @@ struct Hdf5Parser {
     //   pointer   child 8 | its records | records of its subtree; each in as few bytes as its greatest value needs
     template <class F>
     void b_tree_2(uint64_t address, uint64_t type, const F& record) {
-        Cursor c = cursor(address);
-        c.begins("BTHD", 0);
+        Cursor c = structure(address, "BTHD", 0);
         c.expect(c.number(1) == type, "a B-tree of type " + std::to_string(type));
         const auto [node_size, record_size, depth, percents, root, count, all] = c.fields(4, 2, 2, 2, 8, 2, 8);
         c.checksum();
@@ -796,8 +789,7 @@ struct Hdf5Parser {
             subtree_width.push_back(level == 0 ? 0 : width(below));
         }
         const auto node = [&](const auto& self, uint64_t at, uint64_t records, uint64_t level) -> void {
-            Cursor n = cursor(at);
-            n.begins(level == 0 ? "BTLF" : "BTIN", 0);
+            Cursor n = structure(at, level == 0 ? "BTLF" : "BTIN", 0);
             n.expect(n.number(1) == type && records <= most[level], "a node of the B-tree's type and size");
             const uint64_t pointers = level == 0 ? 0 : records + 1, skipped = level == 0 ? 0 : subtree_width[level - 1];
             Cursor body = n.checked(records * record_size + pointers * (8 + width(most[0]) + skipped));
@@ -825,8 +817,7 @@ struct Hdf5Parser {
     };
 
     Heap fractal_heap(uint64_t address) {
-        Cursor c = cursor(address);
-        c.begins("FRHP", 0);
+        Cursor c = structure(address, "FRHP", 0);
         const auto [id_length, filters, flags, most, statistics] = c.fields(2, 2, 1, 4, 96);
         c.expect(filters == 0, "a heap without filters", "hdf5.unsupported");
         const auto [width, smallest, largest, bits, first_rows, root, root_rows] = c.fields(2, 8, 8, 2, 2, 8, 2);
@@ -837,15 +828,15 @@ struct Hdf5Parser {
             "a doubling table of powers of two");
         const uint64_t direct_rows = log2(largest) - log2(smallest) + 2;
         Heap heap{(bits + 7) / 8, log2(std::min(most, largest)) / 8 + 1};
-        const auto begin = [&](Cursor& block, std::string_view signature, uint64_t offset) {
-            block.begins(signature, 0);
+        const auto block_of = [&](uint64_t at, const char* letters, std::optional<uint64_t> size, uint64_t offset) {
+            Cursor block = structure(at, letters, 0, size);
             const bool same = block.number(8) == address && block.number(heap.offset_width) == offset;
             block.expect(same,
                          "a block of the heap at " + std::to_string(address) + ", offset " + std::to_string(offset));
+            return block;
         };
         const auto direct = [&](uint64_t at, uint64_t size, uint64_t offset) {
-            Cursor block = cursor(at, size);
-            begin(block, "FHDB", offset);
+            Cursor block = block_of(at, "FHDB", size, offset);
             const Bytes all = cursor(at, size).take(size);
             if ((flags & 2) != 0) {  // direct blocks have a checksum, which is taken with zeros in its own place
                 const uint64_t stored = block.number(4);
@@ -856,8 +847,7 @@ struct Hdf5Parser {
             heap.blocks[offset] = {at, size};
         };
         const auto indirect = [&](const auto& self, uint64_t at, uint64_t rows, uint64_t offset) -> void {
-            Cursor block = cursor(at);
-            begin(block, "FHIB", offset);
+            Cursor block = block_of(at, "FHIB", {}, offset);
             Cursor children = block.checked(rows * width * 8);
             for (uint64_t row = 0; row < rows; ++row) {
                 const uint64_t power = log2(smallest) + (row == 0 ? 0 : row - 1);
@@ -865,12 +855,11 @@ struct Hdf5Parser {
                 for (uint64_t column = 0; column < width; ++column, offset += uint64_t{1} << power) {
                     const uint64_t child = children.number(8);
                     if (child == undefined_address) continue;
-                    if (row < direct_rows) {
+                    block.expect(row < direct_rows || row >= log2(width), "a table smaller than the one it is in");
+                    if (row < direct_rows)
                         direct(child, uint64_t{1} << power, offset);
-                        continue;
-                    }
-                    block.expect(row >= log2(width), "a table smaller than the one it is in");
-                    self(self, child, row - log2(width), offset);
+                    else
+                        self(self, child, row - log2(width), offset);
                 }
             }
         };
@@ -1172,9 +1161,8 @@ struct Hdf5Parser {
         uint64_t address, size, page;  // of the header; bytes of an entry; entries of a page
     };
 
-    Cursor array_block(const Grid& g, uint64_t address, std::string_view letters, uint64_t header) {
-        Cursor c = cursor(address);
-        c.begins(letters, 0);
+    Cursor array_block(const Grid& g, uint64_t address, const std::string& letters, uint64_t header) {
+        Cursor c = structure(address, letters, 0);
         c.expect(c.number(1) == (g.d.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
         c.expect(header == 0 || c.number(8) == header, "a block of the index at " + std::to_string(header));
         return c;
@@ -1195,7 +1183,7 @@ struct Hdf5Parser {
 
     // Reads a data block of `count` entries. `written`: of the pages, a bit for each, the highest of a byte first; page 0
     // has bit number `bit`. These bits are in a secondary block, or, if there is none, at the block's beginning.
-    void data_block(Grid& g, const EntryArray& array, std::string_view letters, uint64_t address, uint64_t prefix,
+    void data_block(Grid& g, const EntryArray& array, const std::string& letters, uint64_t address, uint64_t prefix,
                     uint64_t first, uint64_t count, Bytes written, uint64_t bit) {
         Cursor c = array_block(g, address, letters, array.address);
         const bool paged = count > array.page;
@@ -1312,7 +1300,7 @@ class Hdf5Writer {
         using T = std::ranges::range_value_t<Range>;
         if constexpr (std::is_same_v<T, uint8_t>)
             if (std::ranges::any_of(data, [](uint8_t flag) { return flag > 1; }))
-                refuse("hdf5.flag", name, "a flag is neither 0 nor 1");
+                fail_dataset("hdf5.flag", file_.path, name, "a flag is neither 0 nor 1");
         add_raw(name, shape, type_of<T>(), sizeof(T), {reinterpret_cast<const char*>(data.data()), data.size_bytes()});
     }
 
@@ -1352,9 +1340,6 @@ class Hdf5Writer {
             return "\x18\2\0\0\1\0\0\0\x10\x08\0\0\1\0\0\0\0\0\x08\0FALSE\0\0\0TRUE\0\0\0\0\0\1"sv;
     }  // any other type does not compile: no return
 
-    [[noreturn]] void refuse(const char* id, const std::string& name, const std::string& why) const {
-        fail_dataset(id, file_.path, name, why);
-    }
     static std::string little(uint64_t value, size_t size) {  // least significant byte first
         std::string bytes(size, '\0');
         std::memcpy(bytes.data(), &value, std::min<size_t>(size, 8));
@@ -1386,17 +1371,17 @@ class Hdf5Writer {
         std::string space = little(1, 1) + little(shape.size(), 1) + little(0, 6);
         for (const uint64_t extent : shape) {  // `size`: of an element, then of all
             if (__builtin_mul_overflow(size, extent, &size) || shape.size() > 32)
-                refuse("hdf5.shape", name, "shape " + shape_text(shape) + " is too large");
+                fail_dataset("hdf5.shape", file_.path, name, "shape " + shape_text(shape) + " is too large");
             space += little(extent, 8);
         }
         Node& node = new_node(name);
         if (data.size() > size)
-            refuse("hdf5.shape", name,
-                   std::to_string(data.size()) + " bytes are more than the " + std::to_string(size) +
-                       " that its shape leaves");
+            fail_dataset("hdf5.shape", file_.path, name,
+                         std::to_string(data.size()) + " bytes are more than the " + std::to_string(size) +
+                             " that its shape leaves");
         if (data.size() < size)
-            refuse("hdf5.shape", name,
-                   std::to_string(size - data.size()) + " bytes fewer were given than its shape has");
+            fail_dataset("hdf5.shape", file_.path, name,
+                         std::to_string(size - data.size()) + " bytes fewer were given than its shape has");
         const uint64_t address = size == 0 ? undefined_address : place(data);
         node.header = header({{0x01, space},                                            // SPEC IV.A.2.b
                               {0x03, std::string(type)},                                // IV.A.2.d
@@ -1414,7 +1399,8 @@ class Hdf5Writer {
             const bool in_use = !child.header.empty() || (end == name.size() && !child.children.empty());
             const bool no_name = part.empty() || part == "." || !is_utf8(part) || has_control(part);
             if (in_use || no_name || node->children.size() > 65535)
-                refuse("hdf5.name", name, "cannot name a data set: a part of it is in use or is no name");
+                fail_dataset("hdf5.name", file_.path, name,
+                             "cannot name a data set: a part of it is in use or is no name");
             leaf_k_ = std::max(leaf_k_, (node->children.size() + 1) / 2);
             node = &child;
             at = end + 1;
