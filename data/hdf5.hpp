@@ -489,8 +489,8 @@ struct Hdf5File {
         Shape start(shape.size());  // of the chunk's first element in the data set
         for (size_t k = start.size(); k-- > 0; place /= dataset.counts[k])
             start[k] = place % dataset.counts[k] * chunk[k];
-        const size_t width = chunk.back() * dataset.element.size,
-                     within = std::min(chunk.back(), shape.back() - start.back());
+        const size_t size = dataset.element.size, width = chunk.back() * size;
+        const size_t within = std::min(chunk.back(), shape.back() - start.back()) * size;
         for (size_t row = 0; row < data.size() / width; ++row) {
             size_t rest = row, to = start.back(), stride = shape.back();
             bool inside = true;
@@ -500,8 +500,7 @@ struct Hdf5File {
                 to += index * stride;
                 stride *= shape[k];
             }
-            if (inside)
-                convert_elements(dataset.element, data.subspan(row * width, within * dataset.element.size), out + to);
+            if (inside) convert_elements(dataset.element, data.subspan(row * width, within), out + to);
         }
     }
 };
@@ -636,11 +635,10 @@ struct Hdf5Parser {
         std::ranges::sort(file.datasets, {}, &Hdf5Dataset::path);
     }
 
-    // --- Object headers, SPEC IV.A.1
+    // SPEC IV.A.1: object headers.
     //   version 1   1 | .. | count 2 | references 4 | size 4 | .. 4 | messages: type 2, size 2, flags 1, .. 3, data
     //   version 2   OHDR 2 | flags | .. | size 1..8 | messages: type 1, size 2, flags 1, [order 2], data | sum
     // A message of type 0x10 says where more of them are (IV.A.2.q): address 8, length 8.
-
     struct Message {
         uint64_t type, flags;
         Cursor data;
@@ -687,8 +685,6 @@ struct Hdf5Parser {
         block.signature("OCHK");
         return block.checked(length - 8);
     }
-
-    // --- Groups
 
     using Links = std::vector<std::pair<std::string, uint64_t>>;  // name, address
 
@@ -890,11 +886,8 @@ struct Hdf5Parser {
         });
     }
 
-    // --- Data sets
-
     // A data set in the making, and what is read of its header but not kept.
-    struct Grid {
-        Hdf5Dataset d;
+    struct Grid : Hdf5Dataset {
         Shape most;                // the extents to which the data set may grow; ~0: without limit
         uint64_t all = 1;          // chunks
         bool whole_edges = false;  // chunks that hang over the edge are not filtered
@@ -906,48 +899,46 @@ struct Hdf5Parser {
 
     void dataset(const std::string& path, const std::vector<Message>& header) {
         Grid g;
-        Hdf5Dataset& d = g.d;
-        d.path = path;
+        g.path = path;
         const auto each = [&](uint64_t type, const auto& read) {
             for (const Message& message : header) {
                 if (message.type != type) continue;
                 if ((message.flags & 2) != 0)
-                    d.unsupported = "its header shares a message with other objects";
+                    g.unsupported = "its header shares a message with other objects";
                 else
                     read(message.data);
             }
         };
         each(0x01, [&](Cursor c) { dataspace(g, c); });
-        each(0x03, [&](Cursor c) { datatype(d, c); });
-        each(0x07, [&](Cursor) { d.unsupported = "its data are in another file"; });
-        each(0x0B, [&](Cursor c) { filter_pipeline(d, c); });
-        if (d.element.kind == Hdf5Element::other && d.unsupported.empty())
-            d.unsupported = "elements of type " + d.type + " are not supported";
-        each(0x05, [&](Cursor c) { fill_value(d, c); });
+        each(0x03, [&](Cursor c) { datatype(g, c); });
+        each(0x07, [&](Cursor) { g.unsupported = "its data are in another file"; });
+        each(0x0B, [&](Cursor c) { filter_pipeline(g, c); });
+        if (g.element.kind == Hdf5Element::other && g.unsupported.empty())
+            g.unsupported = "elements of type " + g.type + " are not supported";
+        each(0x05, [&](Cursor c) { fill_value(g, c); });
         each(0x08, [&](Cursor c) {
-            charge(c.start, sizeof d + path.size());
-            c.expect(d.chunk_bytes == 0, "one layout message");
-            if (d.unsupported.empty()) layout(g, c);
+            charge(c.start, sizeof(Hdf5Dataset) + path.size());
+            c.expect(g.chunk_bytes == 0, "one layout message");
+            if (g.unsupported.empty()) layout(g, c);
         });
-        file.datasets.push_back(std::move(d));
+        file.datasets.push_back(std::move(g));
     }
 
     // SPEC IV.A.2.b: version | rank | flags | kind | [.. 4] | extents 8 each | [largest extents 8 each]
     void dataspace(Grid& g, Cursor c) {
-        Hdf5Dataset& d = g.d;
         const auto [version, rank, flags, kind] = c.fields(1, 1, 1, 1);
         c.expect((version == 1 || version == 2) && rank <= 32, "a data space of version 1 or 2, up to 32 dimensions");
         if (version == 1) c.take(4);
-        d.shape.resize(rank);
-        for (uint64_t& extent : d.shape) extent = c.number(8);
-        g.most = d.shape;
+        g.shape.resize(rank);
+        for (uint64_t& extent : g.shape) extent = c.number(8);
+        g.most = g.shape;
         for (uint64_t& extent : g.most) extent = (flags & 1) != 0 ? c.number(8) : extent;
-        if (version == 2 && kind == 2) d.shape = g.most = {0};  // no elements, no shape
-        d.elements = std::ranges::count(d.shape, 0) == 0 ? 1 : 0;
-        if (d.elements == 0) return;
+        if (version == 2 && kind == 2) g.shape = g.most = {0};  // no elements, no shape
+        g.elements = std::ranges::count(g.shape, 0) == 0 ? 1 : 0;
+        if (g.elements == 0) return;
         for (size_t k = 0; k < rank; ++k) {
-            d.elements = product(d.elements, d.shape[k], c.at);
-            c.expect(d.shape[k] <= g.most[k], "extents that are not above the largest allowed");
+            g.elements = product(g.elements, g.shape[k], c.at);
+            c.expect(g.shape[k] <= g.most[k], "extents that are not above the largest allowed");
         }
     }
 
@@ -1035,14 +1026,14 @@ struct Hdf5Parser {
     void layout(Grid& g, Cursor c) {
         const auto [version, kind] = c.fields(1, 1);
         if (version < 3 || version > 5 || kind > 2) {
-            g.d.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
+            g.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
             return;
         }
-        const uint64_t total = bounded(g.d.elements, g.d.element.size, c);
+        const uint64_t total = bounded(g.elements, g.element.size, c);
         if (kind == 2) return chunked(g, c, version);
-        g.d.filters.clear();
-        g.d.chunk = g.d.shape;
-        g.d.chunk_bytes = total;
+        g.filters.clear();
+        g.chunk = g.shape;
+        g.chunk_bytes = total;
         const auto [elsewhere, size] = c.fields(kind == 0 ? 0 : 8, kind == 0 ? 2 : 8);
         const uint64_t address = kind == 0 ? c.at : elsewhere;
         if (total == 0 || address == undefined_address) return;
@@ -1063,23 +1054,22 @@ struct Hdf5Parser {
     //   B-tree 1   a key: the chunk's size 4, skipped filters 4, its first element 8 each
     //   B-tree 2   a record: an entry (see index_entry), then the chunk's place 8 each
     void chunked(Grid& g, Cursor c, uint64_t version) {
-        Hdf5Dataset& d = g.d;
-        const size_t rank = d.shape.size();
+        const size_t rank = g.shape.size();
         const uint64_t flags = version == 3 ? 0 : c.number(1), extents = c.number(1);
         const uint64_t tree = version == 3 ? c.number(8) : 0, width = version == 3 ? 4 : c.number(1);
         c.expect(extents == rank + 1 && width >= 1 && width <= 8, "chunks of as many dimensions as the data");
-        d.chunk_bytes = d.element.size;
+        g.chunk_bytes = g.element.size;
         for (size_t k = 0; k < rank; ++k) {
-            d.chunk.push_back(c.number(width));
-            c.expect(d.chunk[k] > 0, "chunks that are not empty");
-            d.chunk_bytes = product(d.chunk_bytes, d.chunk[k], c.at);
-            d.counts.push_back(quotient(d.shape[k], d.chunk[k]));
-            g.all = d.elements == 0 ? 0 : product(g.all, d.counts[k], c.at);
+            g.chunk.push_back(c.number(width));
+            c.expect(g.chunk[k] > 0, "chunks that are not empty");
+            g.chunk_bytes = product(g.chunk_bytes, g.chunk[k], c.at);
+            g.counts.push_back(quotient(g.shape[k], g.chunk[k]));
+            g.all = g.elements == 0 ? 0 : product(g.all, g.counts[k], c.at);
         }
-        c.expect(c.number(width) == d.element.size, "chunks of the data's elements");
-        bounded(g.all, d.chunk_bytes, c);
+        c.expect(c.number(width) == g.element.size, "chunks of the data's elements");
+        bounded(g.all, g.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
-        if (d.elements == 0) return;
+        if (g.elements == 0) return;
         Shape place(rank);
         if (version == 3 && tree == undefined_address) return;
         if (version == 3)
@@ -1087,8 +1077,8 @@ struct Hdf5Parser {
                 const auto [size, skipped] = key.fields(4, 4);
                 for (size_t k = 0; k < rank; ++k) {
                     const uint64_t first = key.number(8);
-                    key.expect(first % d.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
-                    place[k] = first / d.chunk[k];
+                    key.expect(first % g.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
+                    place[k] = first / g.chunk[k];
                 }
                 add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
             });
@@ -1101,9 +1091,9 @@ struct Hdf5Parser {
         const uint64_t address = c.number(8);
         if (address == undefined_address) return;
         if (index == 1)
-            return add(g, place, {address, alone ? stored : d.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
+            return add(g, place, {address, alone ? stored : g.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
         if (index == 5)
-            return b_tree_2(address, d.filters.empty() ? 10 : 11, [&](Cursor record) {
+            return b_tree_2(address, g.filters.empty() ? 10 : 11, [&](Cursor record) {
                 const Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
                 for (uint64_t& coordinate : place) coordinate = record.number(8);
                 add(g, place, chunk, record.start);
@@ -1112,7 +1102,7 @@ struct Hdf5Parser {
             g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
         g.step.assign(rank, 1);
         for (size_t k = rank; k-- > 1;)
-            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], d.chunk[g.order[k]]), c.at);
+            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.chunk[g.order[k]]), c.at);
         if (index == 2) return implicit_index(g, address);
         index == 3 ? fixed_array(g, address) : extensible_array(g, address);
     }
@@ -1122,23 +1112,23 @@ struct Hdf5Parser {
         if (chunk.address == undefined_address) return;
         bool partial = false;
         for (size_t k = 0; k < place.size(); ++k) {
-            if (place[k] >= g.d.counts[k]) return;
-            chunk.place = chunk.place * g.d.counts[k] + place[k];
-            partial = partial || g.d.shape[k] - place[k] * g.d.chunk[k] < g.d.chunk[k];
+            if (place[k] >= g.counts[k]) return;
+            chunk.place = chunk.place * g.counts[k] + place[k];
+            partial = partial || g.shape[k] - place[k] * g.chunk[k] < g.chunk[k];
         }
         if (g.whole_edges && partial) chunk.skipped = ~0u;
-        if (g.d.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
+        if (g.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
         require_inside(chunk.address, chunk.size);
         charge(offset, sizeof chunk);
-        g.d.chunks.push_back(chunk);
-        g.d.stored += chunk.size;
+        g.chunks.push_back(chunk);
+        g.stored += chunk.size;
     }
 
     // An entry of an index has `size` bytes: address 8, and with filters the chunk's size 1..8 and those skipped 4.
     static Hdf5Chunk index_entry(const Grid& g, Cursor& c, uint64_t size) {
-        const bool filtered = !g.d.filters.empty();
+        const bool filtered = !g.filters.empty();
         c.expect(filtered ? size > 12 && size <= 20 : size == 8, "entries of 8 bytes, or with filters of 13 to 20");
-        const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.d.chunk_bytes;
+        const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.chunk_bytes;
         return {address, stored, 0, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
     }
 
@@ -1147,10 +1137,10 @@ struct Hdf5Parser {
         Shape place(g.order.size());
         for (uint64_t i = 0; i < g.all; ++i) {
             uint64_t number = 0, rest = i;
-            for (size_t k = place.size(); k-- > 0; rest /= g.d.counts[k]) place[k] = rest % g.d.counts[k];
+            for (size_t k = place.size(); k-- > 0; rest /= g.counts[k]) place[k] = rest % g.counts[k];
             for (size_t k = 0; k < place.size(); ++k) number += place[g.order[k]] * g.step[k];
-            const uint64_t begin = address + product(number, g.d.chunk_bytes, address);
-            add(g, place, {begin, g.d.chunk_bytes, 0, 0}, address);
+            const uint64_t begin = address + product(number, g.chunk_bytes, address);
+            add(g, place, {begin, g.chunk_bytes, 0, 0}, address);
         }
     }
 
@@ -1163,7 +1153,7 @@ struct Hdf5Parser {
 
     Cursor array_block(const Grid& g, uint64_t address, const std::string& letters, uint64_t header) {
         Cursor c = structure(address, letters, 0);
-        c.expect(c.number(1) == (g.d.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
+        c.expect(c.number(1) == (g.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
         c.expect(header == 0 || c.number(8) == header, "a block of the index at " + std::to_string(header));
         return c;
     }
