@@ -1171,8 +1171,8 @@ struct Hdf5Parser {
         }
     }
 
-    // Reads a data block of `count` entries. `written`: of the pages, a bit for each, the highest of a byte first; page 0
-    // has bit number `bit`. These bits are in a secondary block, or, if there is none, at the block's beginning.
+    // Reads a data block of `count` entries. `written`: a bit for each page, the highest of a byte first; page 0 has
+    // bit number `bit`. These bits are in a secondary block, or, if there is none, at the block's beginning.
     void data_block(Grid& g, const EntryArray& array, const std::string& letters, uint64_t address, uint64_t prefix,
                     uint64_t first, uint64_t count, Bytes written, uint64_t bit) {
         Cursor c = array_block(g, address, letters, array.address);
@@ -1275,9 +1275,9 @@ inline Hdf5File open_hdf5(const std::string& path) {
 //   | superblock | data | data | ... | header of a data set | ... | names, heap, node, tree, header of a group | ...
 //
 //   Hdf5Writer file("out.hdf5");
-//   file.add("infos/qpos", {n, 3}, positions);     any vector, array or span; groups come into being with what they hold
+//   file.add("infos/qpos", {n, 3}, positions);   a vector, array or span; groups come into being with what they hold
 //   file.text("metadata/algorithm", "SAC");
-//   file.close();                                  without it no file appears
+//   file.close();                                without it no file appears
 class Hdf5Writer {
   public:
     explicit Hdf5Writer(const std::string& path) : file_(path) { put(std::string(superblock_size, '\0')); }
