@@ -10,17 +10,12 @@
 // Leaves out: numpy's random numbers; files (collect.hpp); how the policy is trained (collect.hpp, sac.hpp).
 #pragma once
 
-#include <array>
-#include <cmath>
-#include <functional>
 #include <numbers>
-#include <string_view>
-#include <utility>
-#include <vector>
 
 #include "../mujoco_env.hpp"
 #include "rows.hpp"
 #include "sac.hpp"
+#include "waypoints.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The planner. Cells are the characters of the map; x runs along columns, and D4RL counts a position to the column
@@ -32,7 +27,7 @@ inline MazeCell ant_cell_of(double x, double y) {
     const auto index = [](double at) { return 1 + static_cast<int>(std::floor(std::max(at, 1e-4) / ant_cell)); };
     return {index(y), index(x)};
 }
-inline std::array<double, 2> ant_cell_centre(MazeCell cell) {
+inline MazePoint ant_cell_centre(MazeCell cell) {
     return {ant_cell * (cell.column - 1), ant_cell * (cell.row - 1)};  // x, y
 }
 
@@ -43,11 +38,8 @@ struct AntPlan {
     // Breadth-first from the goal, neighbours left, right, down, up. A cell in a wall gets a next cell too, but no path
     // leads through it: the torso of an ant may be over the corner of a wall.
     AntPlan(std::string_view map, MazeCell goal) {
-        std::vector<std::string_view> lines;
-        for (size_t at = 0; at < map.size(); at += lines.back().size() + 1)
-            lines.push_back(map.substr(at, map.find('/', at) - at));
-        rows = static_cast<int>(lines.size());
-        columns = static_cast<int>(lines[0].size());
+        columns = static_cast<int>(map.find('/'));
+        rows = static_cast<int>(map.size()) / (columns + 1);
         next.assign(rows * columns, {-1, -1});
         next[number(goal)] = goal;
         std::vector<MazeCell> queue = {goal};
@@ -57,7 +49,7 @@ struct AntPlan {
                 const MazeCell to = {at.row + move.row, at.column + move.column};
                 if (!contains(to) || next[number(to)].row >= 0) continue;
                 next[number(to)] = at;
-                if (lines[to.row][to.column] != '1') queue.push_back(to);
+                if (map[to.row * (columns + 1) + to.column] != '1') queue.push_back(to);
             }
         }
     }
@@ -159,7 +151,7 @@ constexpr uint32_t start = 11, goal_cell = 13, goal = 14;
 // Writes rewards and terminals: 1 where the next row's observation is within 0.5 m of one goal for all rows, else 0.
 // Across the end of an episode this looks into the next one, as D4RL's script does; the last row has 0. `once`: of each
 // run of ones the first alone stays, as is reported of umaze-diverse's file; umaze's has whole runs.
-inline void relabel(CollectedRows<float>& set, std::array<double, 2> goal, bool once) {
+inline void relabel(CollectedRows<float>& set, MazePoint goal, bool once) {
     set.rewards.assign(set.length(), 0);
     bool inside = false;
     for (size_t row = 0; row + 1 < set.length(); ++row) {
@@ -172,23 +164,21 @@ inline void relabel(CollectedRows<float>& set, std::array<double, 2> goal, bool 
 
 // The heading, rad, from the ant to the next cell's centre plus `scatter`, uniform [0, 1) per coordinate and drawn anew
 // in every step, or to the goal where that is in the next cell.
-inline double heading_to_goal(const AntPlan& plan, std::array<double, 2> at, std::array<double, 2> goal,
-                              std::array<double, 2> scatter) {
+inline double heading_to_goal(const AntPlan& plan, MazePoint at, MazePoint goal, MazePoint scatter) {
     const MazeCell cell = ant_cell_of(at[0], at[1]), end = ant_cell_of(goal[0], goal[1]);
     // Off the map, or behind its outermost walls, there is no next cell, and the ant heads for the goal.
     const MazeCell next = plan.contains(cell) ? plan.next[plan.number(cell)] : end;
-    std::array<double, 2> aim = goal;
+    MazePoint aim = goal;
     if (next.row >= 0 && !(next.row == end.row && next.column == end.column))
         for (size_t i = 0; i < 2; ++i) aim[i] = ant_cell_centre(next)[i] + scatter[i];
     return std::atan2(aim[1] - at[1], aim[0] - at[0]);
 }
 
 // A place in one of the cells: its centre plus uniform [0, 1) per coordinate. cell, place: sites of the draws.
-inline std::array<double, 2> draw_ant_place(const std::vector<MazeCell>& cells, const Random& random, uint64_t episode,
-                                            uint32_t cell, uint32_t place) {
-    std::array<double, 2> at = ant_cell_centre(cells[random.below(cells.size(), episode, 0, cell)]);
-    for (uint32_t i = 0; i < 2; ++i) at[i] += random.uniform(episode, 0, place + i);
-    return at;
+inline MazePoint draw_ant_place(const std::vector<MazeCell>& cells, const Random& random, uint64_t episode,
+                                uint32_t cell, uint32_t place) {
+    const MazeCell drawn = cells[random.below(cells.size(), episode, 0, cell)];
+    return scattered(ant_cell_centre(drawn), 0, 1, random, episode, 0, place);
 }
 
 // Row t has what was so before step t and that step's action, and, as in D4RL, infos/qpos and infos/qvel after it.
@@ -221,7 +211,7 @@ inline CollectedRows<float> collect_ant_maze_set(const MujocoTask& task, size_t 
     for (uint64_t episode = data_set_episodes; set.length() < steps; ++episode) {
         environment.reset(resets, episode, state.data());
         const std::span qpos(environment.data->qpos, 15), qvel(environment.data->qvel, 14);
-        std::array<double, 2> goal = environment.goal;
+        MazePoint goal = environment.goal;
         if (diverse) {
             goal = draw_ant_place(goals, random, episode, AntDraw::goal_cell, AntDraw::goal);
             const auto from = draw_ant_place(starts, random, episode, AntDraw::start_cell, AntDraw::start);

@@ -11,13 +11,9 @@
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
 
-#include <cstdlib>
 #include <filesystem>
 #include <fstream>
-#include <map>
-#include <optional>
 
-#include "../memory.hpp"
 #include "../mujoco_env.hpp"
 #include "hdf5.hpp"
 #include "settings.hpp"
@@ -31,46 +27,40 @@ struct PublishedDataSet {
     const char* id;
     const char* file;  // below the address
     size_t steps;      // rows
-    uint64_t bytes;
-    const char* sha256;
     int trajectories;  // complete ones
+    const char* sha256;
     double mean_return, deviation, high, low;
     const char* collected_in;  // what `wodtem collect` takes on one core, as measured
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
 constexpr std::array<PublishedDataSet, 13> published_data_sets{{
-    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 152756557,
-     "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0", 2186, 1422.06, 378.95, 3222.36, 315.87,
-     "1 minute"},
-    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 75854457,
-     "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 2041, 467.30, 511.03, 3192.93, -1.44,
+    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186,
+     "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0", 1422.06, 378.95, 3222.36, 315.87, "1 minute"},
+    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041,
+     "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 467.30, 511.03, 3192.93, -1.44,
      "85,000 updates of 5 ms"},
-    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 232254996,
-     "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 1190, 2852.09, 1095.44, 4226.94, -6.61,
-     "2 minutes"},
-    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 86323963,
-     "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 1093, 682.70, 895.96, 4132.00, -50.20,
+    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 1190,
+     "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 2852.09, 1095.44, 4226.94, -6.61, "2 minutes"},
+    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 1093,
+     "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 682.70, 895.96, 4132.00, -50.20,
      "250,000 updates of 5 ms"},
-    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 237727262,
-     "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 1000, 4770.33, 355.75, 5309.38, -310.23,
-     "1 minute"},
-    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 59448533,
-     "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 202, 3093.29, 1680.69, 4985.14, -638.49,
+    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 1000,
+     "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 4770.33, 355.75, 5309.38, -310.23, "1 minute"},
+    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 202,
+     "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 3093.29, 1680.69, 4985.14, -638.49,
      "125,000 updates of 5 ms"},
-    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 376239825,
-     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 1202, 3051.26, NAN, NAN, NAN, "4 minutes"},
-    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 136482252,
-     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 485, 975.94, NAN, NAN, NAN,
+    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 1202,
+     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 3051.26, NAN, NAN, NAN, "4 minutes"},
+    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 485,
+     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 975.94, NAN, NAN, NAN,
      "390,000 updates of 7 ms"},
     {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
-     1000000, 232532949, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", 0, NAN, NAN, NAN, NAN,
-     "6 minutes"},
+     1000000, 0, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", NAN, NAN, NAN, NAN, "6 minutes"},
     {"antmaze-umaze-diverse-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_True_multigoal_True_sparse_fixed.hdf5",
-     1000000, 230854272, "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932", 0, NAN, NAN, NAN, NAN,
-     "6 minutes"},
-    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, "", 0, NAN, NAN, NAN, NAN, "3 seconds"},
-    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, "", 0, NAN, NAN, NAN, NAN, "8 seconds"},
-    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, "", 0, NAN, NAN, NAN, NAN, "18 seconds"},
+     1000000, 0, "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932", NAN, NAN, NAN, NAN, "6 minutes"},
+    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, "", NAN, NAN, NAN, NAN, "3 seconds"},
+    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, "", NAN, NAN, NAN, NAN, "8 seconds"},
+    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, "", NAN, NAN, NAN, NAN, "18 seconds"},
 }};
 
 inline const PublishedDataSet* find_published(std::string_view id) {
@@ -135,14 +125,13 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
                           std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
     if (!found)
-        fail("dataset.shape", "%s: has no data set \"%s\"; it is not in D4RL's layout", file.path.c_str(),
-             name.c_str());
+        throw Error("dataset.shape", file.path + ": has no data set \"" + name + "\"; it is not in D4RL's layout");
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
+    const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
     if (shape.empty() || shape.size() > 2 || shape[0] != rows.value_or(shape[0]) || width != columns.value_or(width))
-        fail("dataset.shape", "%s: \"%s\" has shape %s, expected %s by %s", file.path.c_str(), name.c_str(),
-             shape_text(shape).c_str(), rows ? std::to_string(*rows).c_str() : "any number",
-             columns ? std::to_string(*columns).c_str() : "any number");
+        throw Error("dataset.shape", file.path + ": \"" + name + "\" has shape " + shape_text(shape) + ", expected " +
+                                         text(rows) + " by " + text(columns));
     return {*found, shape[0], width};
 }
 
@@ -387,16 +376,14 @@ struct DataSetStatistics {
 
 // Counts the rows that are equal to an earlier one, by 64-bit hashes of their bytes.
 inline size_t count_duplicates(const Rows& rows) {
-    std::vector<uint64_t> hashes(rows.count);
-    std::string row;
-    const auto append = [&row](const float* values, size_t n) {
-        row.append(reinterpret_cast<const char*>(values), n * sizeof(float));
+    const auto bytes = [](const std::vector<float>& values, size_t row, size_t width) {
+        return std::string_view(reinterpret_cast<const char*>(&values[row * width]), width * sizeof(float));
     };
+    std::vector<uint64_t> hashes(rows.count);
     for (size_t i = 0; i < rows.count; ++i) {
-        row.clear();
-        append(rows.observation(i), rows.state_dim);
-        append(&rows.actions[i * rows.action_dim], rows.action_dim);
-        append(&rows.rewards[i], 1);
+        std::string row(bytes(rows.observations, i, rows.state_dim));
+        row += bytes(rows.actions, i, rows.action_dim);
+        row += bytes(rows.rewards, i, 1);
         hashes[i] = std::hash<std::string>{}(row);
     }
     std::ranges::sort(hashes);
@@ -437,18 +424,14 @@ inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Traje
 }
 
 inline std::string describe(const DataSetStatistics& s) {
-    char line[400];
-    std::snprintf(line, sizeof line, "trajectories: %.0f (%zu ended by the task), %zu rows in none\n", s.lengths.count,
-                  s.terminated, s.left_out);
-    std::string text = line;
-    text += "lengths:      " + s.lengths.text() + "\nreturns:      " + s.returns.text() + "\n";
-    std::snprintf(line, sizeof line,
-                  "actions:      %.9g to %.9g\nstate columns that never change: %zu\n"
-                  "rows that repeat the observation before: %zu\n"
+    char lines[600];
+    std::snprintf(lines, sizeof lines,
+                  "trajectories: %.0f (%zu ended by the task), %zu rows in none\n"
+                  "lengths:      %s\nreturns:      %s\nactions:      %.9g to %.9g\n"
+                  "state columns that never change: %zu\nrows that repeat the observation before: %zu\n"
                   "rows that are equal to an earlier one: %zu\nnumbers that are not finite: %zu\n",
+                  s.lengths.count, s.terminated, s.left_out, s.lengths.text().c_str(), s.returns.text().c_str(),
                   s.actions.low, s.actions.high, s.dead_columns, s.repeated, s.duplicates, s.not_finite);
-    text += line;
-    text += s.has_next ? "next observations that are not the next row's: " + std::to_string(s.jumps) + "\n"
-                       : "no next observations: the next row's stand in\n";
-    return text;
+    return lines + (s.has_next ? "next observations that are not the next row's: " + std::to_string(s.jumps) + "\n"
+                               : "no next observations: the next row's stand in\n");
 }

@@ -25,54 +25,63 @@ inline uint64_t little_endian(Bytes bytes) {
     return value;
 }
 
+// Fails with a sentence about one data set of a file.
+[[noreturn]] inline void fail_dataset(const char* id, const std::string& file, const std::string& dataset,
+                                      const std::string& why) {
+    throw Error(id, file + ": " + json_string(dataset) + ": " + why);
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Checksums
 
-// Adds one block of 64 bytes to a SHA-256 (FIPS 180-4, section 6.2.2, with its letters).
-inline void sha256_block(std::array<uint32_t, 8>& hash, const uint8_t* block) {
-    static constexpr uint32_t constants[64] = {
-        0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
-        0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
-        0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f, 0x4a7484aa, 0x5cb0a9dc, 0x76f988da,
-        0x983e5152, 0xa831c66d, 0xb00327c8, 0xbf597fc7, 0xc6e00bf3, 0xd5a79147, 0x06ca6351, 0x14292967,
-        0x27b70a85, 0x2e1b2138, 0x4d2c6dfc, 0x53380d13, 0x650a7354, 0x766a0abb, 0x81c2c92e, 0x92722c85,
-        0xa2bfe8a1, 0xa81a664b, 0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070,
-        0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
-        0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
-    uint32_t w[64];
-    for (size_t t = 0; t < 16; ++t) {
-        std::memcpy(&w[t], block + 4 * t, 4);
-        w[t] = __builtin_bswap32(w[t]);
+// Returns the first 32 bits of the fractions of the cube roots of the first 64 primes (FIPS 180-4, section 4.2.2).
+inline std::array<uint32_t, 64> sha256_constants() {
+    std::array<uint32_t, 64> constants;
+    size_t found = 0;
+    for (uint32_t n = 2; found < constants.size(); ++n) {
+        bool prime = true;
+        for (uint32_t divisor = 2; divisor * divisor <= n; ++divisor) prime = prime && n % divisor != 0;
+        const double root = std::cbrt(n);  // of its 53 bits 35 are needed
+        if (prime) constants[found++] = static_cast<uint32_t>((root - std::floor(root)) * 0x1p32);
     }
-    for (size_t t = 16; t < 64; ++t) {
-        const uint32_t x = w[t - 15], y = w[t - 2];
-        const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
-        w[t] = (std::rotr(y, 17) ^ std::rotr(y, 19) ^ y >> 10) + w[t - 7] + s0 + w[t - 16];
-    }
-    std::array<uint32_t, 8> v = hash;
-    for (size_t t = 0; t < 64; ++t) {
-        const auto [a, b, c, d, e, f, g, h] = v;
-        const uint32_t s1 = std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25);
-        const uint32_t s0 = std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22);
-        const uint32_t t1 = h + s1 + ((e & f) ^ (~e & g)) + constants[t] + w[t];
-        const uint32_t t2 = s0 + ((a & b) ^ (a & c) ^ (b & c));
-        v = {t1 + t2, a, b, c, d + t1, e, f, g};
-    }
-    for (size_t i = 0; i < 8; ++i) hash[i] += v[i];
+    return constants;
 }
 
-// Returns the SHA-256 of a message as 64 hexadecimal digits.
+// Returns the SHA-256 of a message (FIPS 180-4, section 6.2.2, with its letters) as 64 hexadecimal digits.
 inline std::string sha256(Bytes message) {
+    static const std::array<uint32_t, 64> constants = sha256_constants();
     std::array<uint32_t, 8> hash = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
                                     0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
-    const size_t whole = message.size() / 64 * 64;
-    for (size_t at = 0; at < whole; at += 64) sha256_block(hash, message.data() + at);
-    uint8_t tail[128] = {};  // the rest, a one bit, zeros, the length in bits (section 5.1.1)
-    const size_t rest = message.size() - whole, end = rest < 56 ? 64 : 128;
-    if (rest > 0) std::memcpy(tail, message.data() + whole, rest);
-    tail[rest] = 0x80;
-    for (size_t i = 0; i < 8; ++i) tail[end - 1 - i] = static_cast<uint8_t>(message.size() * 8 >> (8 * i));
-    for (size_t at = 0; at < end; at += 64) sha256_block(hash, tail + at);
+    const size_t blocks = (message.size() + 8) / 64 + 1;
+    for (size_t block = 0; block < blocks; ++block) {
+        // Section 5.1.1: after the message come a one bit, zeros, and the message's length in bits, u64 big-endian.
+        const Bytes rest = message.subspan(std::min(64 * block, message.size()));
+        std::array<uint8_t, 64> bytes{};
+        std::ranges::copy(rest.first(std::min<size_t>(rest.size(), 64)), bytes.begin());
+        if (rest.size() < 64 && 64 * block <= message.size()) bytes[rest.size()] = 0x80;
+        std::array<uint32_t, 64> w;
+        std::memcpy(w.data(), bytes.data(), 64);
+        for (size_t t = 0; t < 16; ++t) w[t] = __builtin_bswap32(w[t]);
+        if (block + 1 == blocks) {
+            w[14] = static_cast<uint32_t>(message.size() >> 29);
+            w[15] = static_cast<uint32_t>(message.size() << 3);
+        }
+        for (size_t t = 16; t < 64; ++t) {
+            const uint32_t x = w[t - 15], y = w[t - 2];
+            const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
+            w[t] = (std::rotr(y, 17) ^ std::rotr(y, 19) ^ y >> 10) + w[t - 7] + s0 + w[t - 16];
+        }
+        std::array<uint32_t, 8> v = hash;
+        for (size_t t = 0; t < 64; ++t) {
+            const auto [a, b, c, d, e, f, g, h] = v;
+            const uint32_t s1 = std::rotr(e, 6) ^ std::rotr(e, 11) ^ std::rotr(e, 25);
+            const uint32_t s0 = std::rotr(a, 2) ^ std::rotr(a, 13) ^ std::rotr(a, 22);
+            const uint32_t t1 = h + s1 + ((e & f) ^ (~e & g)) + constants[t] + w[t];
+            const uint32_t t2 = s0 + ((a & b) ^ (a & c) ^ (b & c));
+            v = {t1 + t2, a, b, c, d + t1, e, f, g};
+        }
+        for (size_t i = 0; i < 8; ++i) hash[i] += v[i];
+    }
     std::string digits;
     for (const uint32_t word : hash) digits += hex8(word);
     return digits;
@@ -86,19 +95,18 @@ inline uint32_t lookup3(Bytes key) {
     constexpr int mix[] = {4, 6, 8, 16, 19, 4}, last[] = {14, 11, 25, 16, 4, 14, 24};
     std::array<uint32_t, 3> s;
     s.fill(0xDEADBEEF + static_cast<uint32_t>(key.size()));
-    const auto add = [&s](Bytes part) {  // up to 12 bytes; missing ones are zeros
+    if (key.empty()) return s[2];
+    while (true) {
+        const Bytes part = key.first(std::min<size_t>(key.size(), 12));  // where bytes are missing they are zeros
         for (size_t i = 0; i < part.size(); ++i) s[i / 4] += uint32_t{part[i]} << (8 * (i % 4));
-    };
-    for (; key.size() > 12; key = key.subspan(12)) {
-        add(key.first(12));
+        key = key.subspan(part.size());
+        if (key.empty()) break;
         for (size_t i = 0; i < std::size(mix); ++i) {
             uint32_t &x = s[i % 3], &y = s[(i + 2) % 3];
             x = (x - y) ^ std::rotl(y, mix[i]);
             y += s[(i + 1) % 3];
         }
     }
-    if (key.empty()) return s[2];
-    add(key);
     for (size_t i = 0; i < std::size(last); ++i) {
         uint32_t &x = s[(i + 2) % 3], y = s[(i + 1) % 3];
         x = (x ^ y) - std::rotl(y, last[i]);
@@ -106,38 +114,32 @@ inline uint32_t lookup3(Bytes key) {
     return s[2];
 }
 
+// Returns {first + the sum of value(i) over i < count, the sum of the sums so far}, modulo m. Values have 16 bits, so
+// that no sum reaches 2^64 between two reductions.
+template <class F>
+std::array<uint64_t, 2> running_sums(size_t count, uint64_t first, uint64_t m, const F& value) {
+    uint64_t sum = first, sums = 0;
+    for (size_t i = 0; i < count; sum %= m, sums %= m)
+        for (const size_t end = std::min<size_t>(count, i + 4096); i < end; ++i) {
+            sum += value(i);
+            sums += sum;
+        }
+    return {sum, sums};
+}
+
 // Fletcher's checksum of big-endian 16-bit words, as HDF5's filter 3 takes it: modulo 65535, where 65535 stands for 0
 // unless all words are zero.
 inline uint32_t fletcher32(Bytes bytes) {
-    uint64_t sum1 = 0, sum2 = 0;
-    const auto folded = [](uint64_t sum) {
-        while (sum > 65535) sum = (sum & 65535) + (sum >> 16);
-        return sum;
-    };
-    for (size_t i = 0; i < bytes.size(); i += 2) {
-        sum1 += static_cast<uint32_t>(bytes[i] << 8 | (i + 1 < bytes.size() ? bytes[i + 1] : 0));
-        sum2 += sum1;
-        if (i % 65536 != 65534) continue;  // the sums stay below 2^64
-        sum1 = folded(sum1);
-        sum2 = folded(sum2);
-    }
-    return static_cast<uint32_t>(folded(sum2) << 16 | folded(sum1));
+    const auto word = [&](size_t i) { return bytes[2 * i] << 8 | (2 * i + 1 < bytes.size() ? bytes[2 * i + 1] : 0); };
+    const auto [low, high] = running_sums((bytes.size() + 1) / 2, 0, 65535, word);
+    if (std::ranges::all_of(bytes, [](uint8_t byte) { return byte == 0; })) return 0;
+    return static_cast<uint32_t>((high == 0 ? 65535 : high) << 16 | (low == 0 ? 65535 : low));
 }
 
 // RFC 1950, sections 2.2 and 8.
 inline uint32_t adler32(Bytes bytes) {
-    uint32_t a = 1, b = 0;
-    while (!bytes.empty()) {
-        const Bytes part = bytes.first(std::min<size_t>(bytes.size(), 5552));  // b stays below 2^32
-        for (const uint8_t byte : part) {
-            a += byte;
-            b += a;
-        }
-        a %= 65521;
-        b %= 65521;
-        bytes = bytes.subspan(part.size());
-    }
-    return b << 16 | a;
+    const auto [low, high] = running_sums(bytes.size(), 1, 65521, [&](size_t i) { return bytes[i]; });
+    return static_cast<uint32_t>(high << 16 | low);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -164,10 +166,9 @@ struct HuffmanCode {
     bool build(std::span<const uint8_t> lengths) {
         std::array<uint32_t, 16> count{}, next{};
         for (const uint8_t length : lengths) ++count[length];
-        count[0] = 0;
         uint32_t used = 0, longest = 0;  // `used`: share of all codes, in units of 2^-15
         for (uint32_t length = 1; length < 16; ++length) {
-            next[length] = (next[length - 1] + count[length - 1]) << 1;
+            next[length] = used >> (15 - length);
             used += count[length] << (15 - length);
             if (count[length] > 0) longest = length;
         }
@@ -186,26 +187,6 @@ struct HuffmanCode {
         return true;
     }
 };
-
-// Section 3.2.5: a symbol stands for `least` plus a number of `extra` bits, which grow by one every `period` symbols.
-struct NumberRange {
-    uint32_t least, extra;
-};
-template <size_t n>
-constexpr std::array<NumberRange, n> number_ranges(uint32_t least, uint32_t period) {
-    std::array<NumberRange, n> ranges{};
-    for (uint32_t i = 0; i < n; ++i) {
-        ranges[i] = {least, i < period ? 0 : i / period - 1};
-        least += 1u << ranges[i].extra;
-    }
-    return ranges;
-}
-inline constexpr auto length_ranges = [] {
-    auto ranges = number_ranges<29>(3, 4);
-    ranges[28] = {258, 0};
-    return ranges;
-}();
-inline constexpr auto distance_ranges = number_ranges<30>(1, 2);
 
 struct BitReader {
     const uint8_t *in, *in_end;
@@ -229,31 +210,32 @@ struct BitReader {
         take(entry & 15);
         return entry >> 4;
     }
-    uint32_t number(std::span<const NumberRange> ranges, uint32_t symbol) {
-        if (symbol >= ranges.size()) bad_stream("a code that stands for nothing");
-        return ranges[symbol].least + take(ranges[symbol].extra);
+    // Section 3.2.5: a symbol is a number's highest bits, extra bits are the rest: one more for every `period` symbols.
+    uint32_t number(uint32_t symbol, uint32_t period) {
+        if (symbol < 2 * period) return symbol;
+        const uint32_t extra = symbol / period - 1;
+        return ((period + symbol % period) << extra) + take(extra);
     }
 };
 
 // Errors: hdf5.deflate with what was found.
 struct Inflater {
     BitReader source;
-    uint8_t *out_start, *out, *out_end;
+    std::span<uint8_t> out;
+    size_t done = 0;  // bytes of `out`
     HuffmanCode symbols = {}, distances = {};
 
     void stored() {
-        BitReader& s = source;
-        s.in -= s.count / 8;  // whole bytes go back
-        s.bits = 0;
-        s.count = 0;
-        const auto left = static_cast<size_t>(s.in_end - s.in);
-        if (left < 4) bad_stream("the end of the compressed data");
-        const size_t size = little_endian({s.in, 2}), complement = little_endian({s.in + 2, 2});
-        if (size + complement != 65535) bad_stream("a stored block whose length does not match its complement");
-        if (left - 4 < size) bad_stream("the end of the compressed data");
-        if (static_cast<size_t>(out_end - out) < size) bad_stream("more data than the chunk holds");
-        out = std::copy_n(s.in + 4, size, out);
-        s.in += 4 + size;
+        const Bytes left(source.in - source.count / 8, source.in_end);  // whole bytes go back
+        if (left.size() < 4) bad_stream("the end of the compressed data");
+        const size_t size = little_endian(left.first(2));
+        if (size + little_endian(left.subspan(2, 2)) != 65535)
+            bad_stream("a stored block whose length does not match its complement");
+        if (left.size() - 4 < size) bad_stream("the end of the compressed data");
+        if (out.size() - done < size) bad_stream("more data than the chunk holds");
+        std::ranges::copy(left.subspan(4, size), out.begin() + done);
+        done += size;
+        source = {left.data() + 4 + size, source.in_end};
     }
 
     void fixed_codes() {
@@ -268,7 +250,6 @@ struct Inflater {
         constexpr uint8_t order[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
         source.refill();
         const size_t n_symbols = source.take(5) + 257, n_distances = source.take(5) + 1, n_order = source.take(4) + 4;
-        const size_t n = n_symbols + n_distances;
         if (n_symbols > 286 || n_distances > 30) bad_stream("too many codes");
         std::array<uint8_t, 19> first{};  // lengths of the code of lengths
         for (size_t i = 0; i < n_order; ++i) {
@@ -277,18 +258,18 @@ struct Inflater {
         }
         if (!symbols.build(first)) bad_stream("an invalid code of code lengths");
         std::vector<uint8_t> lengths;
-        while (lengths.size() < n) {
+        while (lengths.size() < n_symbols + n_distances) {
             source.refill();
             const uint32_t symbol = source.decode(symbols);
             if (symbol == 16 && lengths.empty()) bad_stream("a repeated code length before the first");
             const auto value = static_cast<uint8_t>(symbol < 16 ? symbol : symbol == 16 ? lengths.back() : 0);
-            size_t times = 1;
-            if (symbol == 16) times = 3 + source.take(2);
-            if (symbol == 17) times = 3 + source.take(3);
-            if (symbol == 18) times = 11 + source.take(7);
+            const size_t times = symbol < 16    ? 1
+                                 : symbol == 16 ? 3 + source.take(2)
+                                 : symbol == 17 ? 3 + source.take(3)
+                                                : 11 + source.take(7);
             lengths.insert(lengths.end(), times, value);
         }
-        if (lengths.size() > n) bad_stream("more code lengths than codes");
+        if (lengths.size() > n_symbols + n_distances) bad_stream("more code lengths than codes");
         if (lengths[256] == 0) bad_stream("no code for the end of the block");
         if (!symbols.build(std::span(lengths).first(n_symbols)) ||
             !distances.build(std::span(lengths).last(n_distances)))
@@ -296,58 +277,62 @@ struct Inflater {
     }
 
     void compressed() {
-        BitReader s = source;  // local copies: for all the compiler knows, a byte written to `out` could be in *this
-        uint8_t* to = out;
+        // Local copies: for all the compiler knows, a byte written to `out` could be in *this.
+        BitReader s = source;
+        uint8_t* to = out.data() + done;
+        uint8_t* const end = out.data() + out.size();
         while (true) {
             s.refill();  // a length, a distance and the extra bits of both take 48 at most
             const uint32_t symbol = s.decode(symbols);
+            if (symbol == 256) break;
             if (symbol < 256) {
-                if (to == out_end) bad_stream("more data than the chunk holds");
+                if (to == end) bad_stream("more data than the chunk holds");
                 *to++ = static_cast<uint8_t>(symbol);
                 continue;
             }
-            if (symbol == 256) break;
-            const size_t length = s.number(length_ranges, symbol - 257);
-            const size_t distance = s.number(distance_ranges, s.decode(distances));
-            if (distance > static_cast<size_t>(to - out_start)) bad_stream("a distance to before the start");
-            if (length > static_cast<size_t>(out_end - to)) bad_stream("more data than the chunk holds");
+            if (symbol > 285) bad_stream("a code that stands for nothing");
+            const size_t length = symbol == 285 ? 258 : 3 + s.number(symbol - 257, 4);
+            const uint32_t far = s.decode(distances);
+            if (far > 29) bad_stream("a code that stands for nothing");
+            const size_t distance = 1 + s.number(far, 2);
+            if (distance > static_cast<size_t>(to - out.data())) bad_stream("a distance to before the start");
+            if (length > static_cast<size_t>(end - to)) bad_stream("more data than the chunk holds");
             const uint8_t* from = to - distance;
             for (size_t i = 0; i < length; ++i) *to++ = *from++;  // may read what it wrote: a repeated pattern
         }
         source = s;
-        out = to;
+        done = static_cast<size_t>(to - out.data());
     }
 
     void run() {
-        bool last = false;
-        while (!last) {
+        for (bool last = false; !last;) {
             source.refill();
             last = source.take(1) == 1;
             const uint32_t type = source.take(2);
-            if (type == 3) bad_stream("a block of type 3");
+            if (type == 0) stored();
             if (type == 1) fixed_codes();
             if (type == 2) read_codes();
-            if (type == 0)
-                stored();
-            else
-                compressed();
+            if (type == 3) bad_stream("a block of type 3");
+            if (type > 0) compressed();
         }
         if (source.count < 0) bad_stream("the end of the compressed data");
         source.in -= source.count / 8;
     }
 };
 
-// Fills `out`, which must have the exact size of the data. Errors: hdf5.deflate with what was found.
-inline void inflate_zlib(Bytes in, std::span<uint8_t> out) {
+// Returns the data, which must be `size` bytes. Errors: hdf5.deflate with what was found.
+inline std::vector<uint8_t> inflate_zlib(Bytes in, size_t size) {
     const bool header = in.size() >= 6 && (in[0] & 15) == 8 && in[0] >> 4 <= 7 && (in[0] << 8 | in[1]) % 31 == 0;
     if (!header || (in[1] & 32) != 0) bad_stream("no zlib header");  // 32: with a dictionary
+    std::vector<uint8_t> out(size);
     const BitReader source{in.data() + 2, in.data() + in.size() - 4};
-    const auto state = std::make_unique<Inflater>(source, out.data(), out.data(), out.data() + out.size());  // 128 kB
+    const auto state = std::make_unique<Inflater>(source, out);  // 128 kB
     state->run();
-    if (state->out != state->out_end) bad_stream("less data than the chunk holds");
+    if (state->done != size) bad_stream("less data than the chunk holds");
     if (state->source.in != source.in_end) bad_stream("bytes after the end of the compressed data");
     if (__builtin_bswap32(static_cast<uint32_t>(little_endian(in.last(4)))) != adler32(out))
         bad_stream("data that does not match its Adler-32 checksum");
+    return out;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -391,14 +376,8 @@ struct Hdf5Chunk {
 
 enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
 
-// All chunks of a data set have the same extents. Here shape (4, 5), chunks of (2, 2), counts (2, 3); the last ones
-// hang over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
-//
-//   +-------+-------+---+---+
-//   | chunk | chunk | ch|unk|      place 0, 1, 2
-//   +-------+-------+---+---+
-//   | chunk | chunk | ch|unk|      place 3, 4, 5
-//   +-------+-------+---+---+
+// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has counts (2, 3); the last chunk of
+// each row hangs over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
 struct Hdf5Dataset {
     std::string path;         // "infos/qpos": no slash at the start
     Shape shape;              // {}: a scalar
@@ -427,52 +406,61 @@ struct Hdf5File {
         return found != datasets.end() && found->path == name ? &*found : nullptr;
     }
 
-    // Returns all elements, row-major, each rounded to the nearest float (beyond the range: infinity).
-    // Errors: hdf5.unsupported, hdf5.type, hdf5.deflate, hdf5.checksum, hdf5.format.
-    std::vector<float> read_floats(const Hdf5Dataset& dataset) const { return read<float>(dataset); }
-
-    // Returns booleans, stored as any kind of number. Errors: those of read_floats; hdf5.flag for anything but 0 and 1.
+    // Returns booleans, stored as any kind of number. Errors: those of read; hdf5.flag for anything but 0 and 1.
     std::vector<uint8_t> read_flags(const Hdf5Dataset& dataset) const {
         const std::vector<double> values = read<double>(dataset);
         const auto other = std::ranges::find_if(values, [](double value) { return value != 0 && value != 1; });
         if (other != values.end())
-            fail("hdf5.flag", "%s: element %zu is neither 0 nor 1, so this is no data set of flags",
-                 where(dataset).c_str(), static_cast<size_t>(other - values.begin()));
+            fail_dataset("hdf5.flag", path, dataset.path,
+                         "element " + std::to_string(other - values.begin()) +
+                             " is neither 0 nor 1, so this is no data set of flags");
         return {values.begin(), values.end()};
     }
 
-    std::string where(const Hdf5Dataset& dataset) const { return path + ": " + json_string(dataset.path); }
+    // Returns all elements, row-major, each rounded to the nearest T (beyond the range: infinity).
+    // Errors: hdf5.unsupported, hdf5.type, hdf5.deflate, hdf5.checksum, hdf5.format.
+    template <class T>
+    std::vector<T> read(const Hdf5Dataset& dataset) const {
+        const Hdf5Element& element = dataset.element;
+        if (!dataset.unsupported.empty())
+            fail_dataset("hdf5.unsupported", path, dataset.path, "cannot be read: " + dataset.unsupported);
+        if (element.kind == Hdf5Element::text)
+            fail_dataset("hdf5.type", path, dataset.path, "is " + dataset.type + ", expected numbers");
+        std::vector<T> out(dataset.elements,
+                           dataset.fill.empty() ? T{} : element_value<T>(element, dataset.fill.data()));
+        std::vector<uint8_t> buffer;
+        for (const Hdf5Chunk& chunk : dataset.chunks) {
+            const Bytes data = decode(dataset, chunk, buffer);
+            if (dataset.chunk == dataset.shape)
+                convert_elements(element, data, out.data());
+            else
+                convert_chunk(dataset, chunk.place, data, out.data());
+        }
+        return out;
+    }
+    std::vector<float> read_floats(const Hdf5Dataset& dataset) const { return read<float>(dataset); }
 
     // Returns the chunk_bytes bytes of a chunk, its filters undone from the last to the first (SPEC IV.A.2.l). They lie
-    // in the file or in one of the buffers.
-    Bytes decode(const Hdf5Dataset& dataset, const Hdf5Chunk& chunk,
-                 std::array<std::vector<uint8_t>, 2>& buffers) const {
-        const auto applied = [&](size_t i) { return (chunk.skipped >> i & 1) == 0; };
+    // in the file or in the buffer.
+    Bytes decode(const Hdf5Dataset& dataset, const Hdf5Chunk& chunk, std::vector<uint8_t>& buffer) const {
+        std::vector<Hdf5Filter> filters;  // that were applied
+        for (size_t i = 0; i < dataset.filters.size(); ++i)
+            if ((chunk.skipped >> i & 1) == 0) filters.push_back(dataset.filters[i]);
+        size_t sums = std::ranges::count(filters, Hdf5Filter::fletcher);  // that are still to be taken off
         Bytes data = bytes.subspan(chunk.address, chunk.size);
         try {
-            for (size_t i = dataset.filters.size(); i-- > 0;) {
-                if (!applied(i)) continue;
-                std::vector<uint8_t>& out = buffers[data.data() == buffers[0].data()];  // not the one that is read
-                if (dataset.filters[i] == Hdf5Filter::fletcher) {
-                    data = without_checksum(data);
-                    continue;
-                }
-                if (dataset.filters[i] == Hdf5Filter::shuffle) {
-                    unshuffle(data, dataset.element.size, out);
-                } else {
-                    size_t size = dataset.chunk_bytes;
-                    for (size_t k = 0; k < i; ++k)
-                        if (dataset.filters[k] == Hdf5Filter::fletcher && applied(k)) size += 4;
-                    out.resize(size);
-                    inflate_zlib(data, out);
-                }
-                data = out;
+            for (const Hdf5Filter filter : std::views::reverse(filters)) {
+                if (filter == Hdf5Filter::deflate) buffer = inflate_zlib(data, dataset.chunk_bytes + 4 * sums);
+                if (filter == Hdf5Filter::shuffle) buffer = unshuffled(data, dataset.element.size);
+                data = filter == Hdf5Filter::fletcher ? without_checksum(data) : buffer;
+                sums -= filter == Hdf5Filter::fletcher;
             }
             if (data.size() != dataset.chunk_bytes)
                 throw Error("hdf5.format", "a chunk of another size than the others");
         } catch (const Error& error) {
-            fail(error.id.c_str(), "%s: chunk at offset %zu: found %s; the file is damaged, use another copy",
-                 where(dataset).c_str(), static_cast<size_t>(chunk.address), error.what());
+            fail_dataset(error.id.c_str(), path, dataset.path,
+                         "chunk at offset " + std::to_string(chunk.address) + ": found " + error.what() +
+                             "; the file is damaged, use another copy");
         }
         return data;
     }
@@ -486,55 +474,34 @@ struct Hdf5File {
     }
 
     // Shuffled data are byte 0 of all elements, then byte 1 of all, ...; a rest below one element stays in place.
-    static void unshuffle(Bytes data, size_t width, std::vector<uint8_t>& out) {
-        out.assign(data.begin(), data.end());
+    static std::vector<uint8_t> unshuffled(Bytes data, size_t width) {
+        std::vector<uint8_t> out(data.begin(), data.end());
         const size_t count = data.size() / width;
         for (size_t j = 0; j < width; ++j)
             for (size_t k = 0; k < count; ++k) out[k * width + j] = data[j * count + k];
-    }
-
-    // Errors: as read_floats.
-    template <class T>
-    std::vector<T> read(const Hdf5Dataset& dataset) const {
-        const Hdf5Element& element = dataset.element;
-        if (!dataset.unsupported.empty())
-            fail("hdf5.unsupported", "%s: cannot be read: %s", where(dataset).c_str(), dataset.unsupported.c_str());
-        if (element.kind == Hdf5Element::text)
-            fail("hdf5.type", "%s: is %s, expected numbers", where(dataset).c_str(), dataset.type.c_str());
-        std::vector<T> out(dataset.elements,
-                           dataset.fill.empty() ? T{} : element_value<T>(element, dataset.fill.data()));
-        std::array<std::vector<uint8_t>, 2> buffers;
-        std::vector<T> values;
-        for (const Hdf5Chunk& chunk : dataset.chunks) {
-            const Bytes data = decode(dataset, chunk, buffers);
-            if (dataset.chunk == dataset.shape) {
-                convert_elements(element, data, out.data());
-                continue;
-            }
-            values.resize(data.size() / element.size);
-            convert_elements(element, data, values.data());
-            Shape start(dataset.shape.size());  // of the chunk's first element in the data set
-            uint64_t rest = chunk.place;
-            for (size_t k = start.size(); k-- > 0; rest /= dataset.counts[k])
-                start[k] = rest % dataset.counts[k] * dataset.chunk[k];
-            copy_chunk(dataset, start, 0, 0, 0, values, out);
-        }
         return out;
     }
 
-    // Copies the part of a chunk that lies within the data set, one dimension k after the other. `from` and `to` number
-    // the rows of the dimensions before k, row-major, in the chunk and in the data set.
+    // Converts the part of a chunk that lies within the data set, row after row of the last dimension.
     template <class T>
-    static void copy_chunk(const Hdf5Dataset& dataset, const Shape& start, size_t k, size_t from, size_t to,
-                           const std::vector<T>& values, std::vector<T>& out) {
-        const size_t extent = std::min(dataset.chunk[k], dataset.shape[k] - start[k]);
-        from = from * dataset.chunk[k];
-        to = to * dataset.shape[k] + start[k];
-        if (k + 1 == start.size()) {
-            std::copy_n(&values[from], extent, &out[to]);
-            return;
+    static void convert_chunk(const Hdf5Dataset& dataset, uint64_t place, Bytes data, T* out) {
+        const Shape &shape = dataset.shape, &chunk = dataset.chunk;
+        Shape start(shape.size());  // of the chunk's first element in the data set
+        for (size_t k = start.size(); k-- > 0; place /= dataset.counts[k])
+            start[k] = place % dataset.counts[k] * chunk[k];
+        const size_t size = dataset.element.size, width = chunk.back() * size;
+        const size_t within = std::min(chunk.back(), shape.back() - start.back()) * size;
+        for (size_t row = 0; row < data.size() / width; ++row) {
+            size_t rest = row, to = start.back(), stride = shape.back();
+            bool inside = true;
+            for (size_t k = shape.size() - 1; k-- > 0; rest /= chunk[k]) {
+                const size_t index = start[k] + rest % chunk[k];
+                inside = inside && index < shape[k];
+                to += index * stride;
+                stride *= shape[k];
+            }
+            if (inside) convert_elements(dataset.element, data.subspan(row * width, within), out + to);
         }
-        for (size_t i = 0; i < extent; ++i) copy_chunk(dataset, start, k + 1, from + i, to + i, values, out);
     }
 };
 
@@ -578,12 +545,6 @@ struct Hdf5Parser {
         if (n > budget) damaged("hdf5.cycle", offset, "an end: structures refer to each other in a circle");
         budget -= n;
     }
-    // Returns a part of the file; structures are read through here alone.
-    Bytes bytes(uint64_t offset, uint64_t n) {
-        require_inside(offset, n);
-        charge(offset, n);
-        return file.bytes.subspan(offset, n);
-    }
     uint64_t product(uint64_t a, uint64_t b, uint64_t offset) const {
         uint64_t result;
         if (__builtin_mul_overflow(a, b, &result)) damaged("hdf5.too_large", offset, "a size of at most 64 bits");
@@ -592,7 +553,7 @@ struct Hdf5Parser {
     static uint64_t quotient(uint64_t a, uint64_t b) { return a / b + (a % b != 0 ? 1 : 0); }  // rounded up
     static uint64_t log2(uint64_t value) { return static_cast<uint64_t>(std::bit_width(value)) - 1; }
 
-    // Reads one field after the other from [at, end).
+    // Reads one field after the other from [at, end), which lies in the file.
     struct Cursor {
         Hdf5Parser& parser;
         uint64_t at, end;
@@ -601,8 +562,9 @@ struct Hdf5Parser {
         Bytes take(uint64_t n) {
             if (n > end - at)
                 parser.damaged("hdf5.truncated", at, std::to_string(n) + " bytes before " + std::to_string(end));
+            parser.charge(at, n);
             at += n;
-            return parser.bytes(at - n, n);
+            return parser.file.bytes.subspan(at - n, n);
         }
         uint64_t number(uint64_t size) { return little_endian(take(size)); }
         // Returns the next fields, given their sizes in bytes; one of more than 8 bytes is not needed here.
@@ -616,10 +578,6 @@ struct Hdf5Parser {
         void signature(std::string_view letters) {
             const Bytes found = take(letters.size());
             expect(std::ranges::equal(found, as_bytes(letters)), "the signature " + std::string(letters));
-        }
-        void begins(std::string_view letters, uint64_t version) {
-            signature(letters);
-            expect(number(1) == version, "the byte " + std::to_string(version) + " after " + std::string(letters));
         }
         // Bytes `start` to here are covered by the checksum that follows.
         void checksum() {
@@ -639,6 +597,13 @@ struct Hdf5Parser {
     Cursor cursor(uint64_t address, std::optional<uint64_t> size = {}) {
         require_inside(address, size.value_or(0));
         return {*this, address, size ? address + *size : file.bytes.size()};
+    }
+    // Returns a cursor behind the letters and the byte (mostly a version) with which a structure begins.
+    Cursor structure(uint64_t address, const std::string& letters, uint64_t byte, std::optional<uint64_t> size = {}) {
+        Cursor c = cursor(address, size);
+        c.signature(letters);
+        c.expect(c.number(1) == byte, "the byte " + std::to_string(byte) + " after " + letters);
+        return c;
     }
 
     // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...; a user block may come before it.
@@ -670,11 +635,10 @@ struct Hdf5Parser {
         std::ranges::sort(file.datasets, {}, &Hdf5Dataset::path);
     }
 
-    // --- Object headers, SPEC IV.A.1
+    // SPEC IV.A.1: object headers.
     //   version 1   1 | .. | count 2 | references 4 | size 4 | .. 4 | messages: type 2, size 2, flags 1, .. 3, data
     //   version 2   OHDR 2 | flags | .. | size 1..8 | messages: type 1, size 2, flags 1, [order 2], data | sum
     // A message of type 0x10 says where more of them are (IV.A.2.q): address 8, length 8.
-
     struct Message {
         uint64_t type, flags;
         Cursor data;
@@ -684,13 +648,13 @@ struct Hdf5Parser {
         std::vector<Message> out;
         std::vector<Cursor> blocks;
         uint64_t type_size = 2, rest = 3;  // bytes of the type, and between flags and data
-        Cursor c = cursor(address);
-        const bool old = bytes(address, 1)[0] == 1;
+        Cursor first = cursor(address);
+        const bool old = cursor(address, 1).number(1) == 1;
         if (old) {
-            const auto [counts, size, reserved] = c.fields(8, 4, 4);
-            blocks.push_back(cursor(c.at, size));
+            const auto [counts, size, reserved] = first.fields(8, 4, 4);
+            blocks.push_back(cursor(first.at, size));
         } else {
-            c.begins("OHDR", 2);
+            Cursor c = structure(address, "OHDR", 2);
             const uint64_t flags = c.number(1);
             c.take(((flags & 32) != 0 ? 16 : 0) + ((flags & 16) != 0 ? 4 : 0));
             type_size = 1;
@@ -722,12 +686,7 @@ struct Hdf5Parser {
         return block.checked(length - 8);
     }
 
-    // --- Groups
-
-    struct Link {
-        std::string name;
-        uint64_t address;
-    };
+    using Links = std::vector<std::pair<std::string, uint64_t>>;  // name, address
 
     // Reads the data set or group that a link leads to. A link to a named type is passed over.
     void link(const std::string& path, uint64_t address, int depth) {
@@ -738,16 +697,16 @@ struct Hdf5Parser {
         if (has(0x08)) return dataset(path, header);
         if (!has(0x11) && !has(0x02)) return;
         if (!groups.insert(address).second) damaged("hdf5.cycle", address, "a group that is linked to once");
-        std::vector<Link> links;
+        Links links;
         for (const Message& message : header) {
             if (message.type == 0x11) symbol_table(links, message.data);
             if (message.type == 0x02) dense_links(links, message.data);
             if (message.type == 0x06) link_message(links, message.data);
         }
-        for (const Link& child : links) {
-            if (child.name.empty() || has_control(child.name) || child.name.find('/') != std::string::npos)
+        for (const auto& [name, child] : links) {
+            if (name.empty() || has_control(name) || name.find('/') != std::string::npos)
                 damaged("hdf5.format", address, "names without slashes and control characters");
-            link(path.empty() ? child.name : path + "/" + child.name, child.address, depth + 1);
+            link(path.empty() ? name : path + "/" + name, child, depth + 1);
         }
     }
 
@@ -756,8 +715,7 @@ struct Hdf5Parser {
     static constexpr uint64_t any_level = 256;
     template <class F>
     void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const F& leaf, uint64_t level = any_level) {
-        Cursor c = cursor(address);
-        c.begins("TREE", type);
+        Cursor c = structure(address, "TREE", type);
         const auto [depth, entries, siblings] = c.fields(1, 2, 16);
         c.expect(level == any_level || depth == level, "a node one level below the last");
         for (uint64_t i = 0; i < entries; ++i) {
@@ -775,15 +733,13 @@ struct Hdf5Parser {
     //   message      B-tree 8 | local heap 8
     //   local heap   HEAP 0 | .. 3 | size 8 | free list 8 | names 8, each ended by a NUL                 (III.D)
     //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 20        (III.B, III.C)
-    void symbol_table(std::vector<Link>& links, Cursor message) {
+    void symbol_table(Links& links, Cursor message) {
         const auto [tree, heap_address] = message.fields(8, 8);
-        Cursor heap = cursor(heap_address);
-        heap.begins("HEAP", 0);
+        Cursor heap = structure(heap_address, "HEAP", 0);
         const auto [reserved, size, free, segment] = heap.fields(3, 8, 8, 8);
-        const Bytes names = bytes(segment, size);
+        const Bytes names = cursor(segment, size).take(size);
         b_tree_1(tree, 0, 8, [&](Cursor, uint64_t node) {
-            Cursor c = cursor(node);
-            c.begins("SNOD", 1);
+            Cursor c = structure(node, "SNOD", 1);
             const auto [unused, count] = c.fields(1, 2);
             for (uint64_t n = 0; n < count; ++n) {
                 const auto [name, header, kind, scratch] = c.fields(8, 8, 4, 20);
@@ -792,68 +748,57 @@ struct Hdf5Parser {
                 const auto end = std::ranges::find(rest, 0);
                 c.expect(end != rest.end(), "a name that ends");
                 charge(c.at, static_cast<size_t>(end - rest.begin()));
-                if (kind != 2) links.push_back({std::string(rest.begin(), end), header});  // 2: a soft link
+                if (kind != 2) links.emplace_back(std::string(rest.begin(), end), header);  // 2: a soft link
             }
         });
     }
 
     // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name | address 8
-    void link_message(std::vector<Link>& links, Cursor c) {
+    void link_message(Links& links, Cursor c) {
         const auto [version, flags] = c.fields(1, 1);
         c.expect(version == 1, "a link message of version 1");
         const uint64_t type = (flags & 8) != 0 ? c.number(1) : 0;
         c.take(((flags & 4) != 0 ? 8 : 0) + ((flags & 16) != 0 ? 1 : 0));
         const Bytes name = c.take(c.number(uint64_t{1} << (flags & 3)));
-        if (type == 0) links.push_back({std::string(name.begin(), name.end()), c.number(8)});
+        if (type == 0) links.emplace_back(std::string(name.begin(), name.end()), c.number(8));
     }
 
     // SPEC III.A.2: a version-2 B-tree. Calls record(cursor) for each record.
     //   BTHD 0 | type | node size 4 | record size 2 | depth 2 | percents 1, 1 | root 8 | its records 2 | all 8 | sum
     //   BTLF 0 or BTIN 0 | type | records | in BTIN pointers, one more than records | sum
     //   pointer   child 8 | its records | records of its subtree; each in as few bytes as its greatest value needs
-    struct Tree2 {
-        uint64_t type, record_size;
-        std::vector<uint64_t> most = {}, subtree_width = {};  // by level: records in a node; bytes of a subtree's count
-        static uint64_t width(uint64_t greatest) { return log2(greatest) / 8 + 1; }
-    };
-
     template <class F>
     void b_tree_2(uint64_t address, uint64_t type, const F& record) {
-        Cursor c = cursor(address);
-        c.begins("BTHD", 0);
+        Cursor c = structure(address, "BTHD", 0);
         c.expect(c.number(1) == type, "a B-tree of type " + std::to_string(type));
         const auto [node_size, record_size, depth, percents, root, count, all] = c.fields(4, 2, 2, 2, 8, 2, 8);
         c.checksum();
         c.expect(record_size > 0 && node_size >= 10 + record_size && depth <= 32, "room for records in a node");
-        Tree2 tree{type, record_size};
-        uint64_t below = 0;  // the most records in a subtree
+        const auto width = [](uint64_t greatest) { return log2(greatest) / 8 + 1; };
+        Shape most, subtree_width;  // by level: records in a node; bytes of a subtree's count
+        uint64_t below = 0;         // the most records in a subtree
         for (uint64_t level = 0; level <= depth; ++level) {
-            const uint64_t pointer = level == 0 ? 0 : 8 + Tree2::width(tree.most[0]) + tree.subtree_width.back();
+            const uint64_t pointer = level == 0 ? 0 : 8 + width(most[0]) + subtree_width.back();
             c.expect(node_size >= 10 + pointer, "room for a pointer in a node");
-            tree.most.push_back((node_size - 10 - pointer) / (record_size + pointer));
-            below = product(tree.most.back() + 1, below, address) + tree.most.back();
-            tree.subtree_width.push_back(level == 0 ? 0 : Tree2::width(below));
+            most.push_back((node_size - 10 - pointer) / (record_size + pointer));
+            below = product(most.back() + 1, below, address) + most.back();
+            subtree_width.push_back(level == 0 ? 0 : width(below));
         }
-        if (root != undefined_address) tree_2_node(tree, root, count, depth, record);
-    }
-
-    template <class F>
-    void tree_2_node(const Tree2& tree, uint64_t address, uint64_t count, uint64_t level, const F& record) {
-        Cursor c = cursor(address);
-        c.begins(level == 0 ? "BTLF" : "BTIN", 0);
-        c.expect(c.number(1) == tree.type && count <= tree.most[level], "a node of the B-tree's type and size");
-        const uint64_t count_width = Tree2::width(tree.most[0]);
-        const uint64_t skipped = level == 0 ? 0 : tree.subtree_width[level - 1];
-        const uint64_t pointers = level == 0 ? 0 : count + 1;
-        Cursor body = c.checked(count * tree.record_size + pointers * (8 + count_width + skipped));
-        for (uint64_t i = 0; i < count; ++i) {
-            record(cursor(body.at, tree.record_size));
-            body.take(tree.record_size);
-        }
-        for (uint64_t i = 0; i < pointers; ++i) {
-            const auto [child, child_count, all] = body.fields(8, count_width, skipped);
-            tree_2_node(tree, child, child_count, level - 1, record);
-        }
+        const auto node = [&](const auto& self, uint64_t at, uint64_t records, uint64_t level) -> void {
+            Cursor n = structure(at, level == 0 ? "BTLF" : "BTIN", 0);
+            n.expect(n.number(1) == type && records <= most[level], "a node of the B-tree's type and size");
+            const uint64_t pointers = level == 0 ? 0 : records + 1, skipped = level == 0 ? 0 : subtree_width[level - 1];
+            Cursor body = n.checked(records * record_size + pointers * (8 + width(most[0]) + skipped));
+            for (uint64_t i = 0; i < records; ++i) {
+                record(cursor(body.at, record_size));
+                body.take(record_size);
+            }
+            for (uint64_t i = 0; i < pointers; ++i) {
+                const auto [child, child_records, subtree] = body.fields(8, width(most[0]), skipped);
+                self(self, child, child_records, level - 1);
+            }
+        };
+        if (root != undefined_address) node(node, root, count, depth);
     }
 
     // SPEC III.G: a fractal heap holds objects, found by their offset in a space of its own, in a doubling table: rows
@@ -863,72 +808,66 @@ struct Hdf5Parser {
     //            largest direct block 8 | bits of an offset 2 | .. 2 | root block 8 | its rows 2 | .. | sum
     //   FHDB 0 | heap 8 | offset | [sum] | objects           FHIB 0 | heap 8 | offset | addresses of blocks | sum
     struct Heap {
-        uint64_t address, width, smallest, direct_rows, offset_width, length_width;
-        bool checked;                                                   // direct blocks have a checksum
+        uint64_t offset_width, length_width;                            // bytes of each in a heap ID
         std::map<uint64_t, std::pair<uint64_t, uint64_t>> blocks = {};  // offset -> address, size in the file
     };
 
     Heap fractal_heap(uint64_t address) {
-        Cursor c = cursor(address);
-        c.begins("FRHP", 0);
+        Cursor c = structure(address, "FRHP", 0);
         const auto [id_length, filters, flags, most, statistics] = c.fields(2, 2, 1, 4, 96);
         c.expect(filters == 0, "a heap without filters", "hdf5.unsupported");
-        const auto [width, smallest, largest, bits, first_rows, root, rows] = c.fields(2, 8, 8, 2, 2, 8, 2);
+        const auto [width, smallest, largest, bits, first_rows, root, root_rows] = c.fields(2, 8, 8, 2, 2, 8, 2);
         c.checksum();
         const bool powers = std::has_single_bit(width) && std::has_single_bit(smallest) && std::has_single_bit(largest);
-        c.expect(powers && smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && most > 0 && rows <= 64,
-                 "a doubling table of powers of two");
+        c.expect(
+            powers && smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && most > 0 && root_rows <= 64,
+            "a doubling table of powers of two");
         const uint64_t direct_rows = log2(largest) - log2(smallest) + 2;
-        const uint64_t length_width = log2(std::min(most, largest)) / 8 + 1;
-        Heap heap{address, width, smallest, direct_rows, (bits + 7) / 8, length_width, (flags & 2) != 0};
-        if (root != undefined_address && rows == 0) direct_block(heap, root, smallest, 0);
-        if (root != undefined_address && rows > 0) indirect_block(heap, root, rows, 0);
-        return heap;
-    }
-
-    static void heap_block(const Heap& heap, Cursor& c, std::string_view signature, uint64_t offset) {
-        c.begins(signature, 0);
-        const bool same = c.number(8) == heap.address && c.number(heap.offset_width) == offset;
-        c.expect(same, "a block of the heap at " + std::to_string(heap.address) + ", offset " + std::to_string(offset));
-    }
-
-    void direct_block(Heap& heap, uint64_t address, uint64_t size, uint64_t offset) {
-        Cursor c = cursor(address, size);
-        heap_block(heap, c, "FHDB", offset);
-        const Bytes all = bytes(address, size);
-        if (heap.checked) {  // the checksum is taken with zeros in its own place
-            const uint64_t stored = c.number(4);
-            std::vector<uint8_t> covered(all.begin(), all.end());
-            std::fill_n(&covered[c.at - 4 - address], 4, uint8_t{0});
-            c.expect(stored == lookup3(covered), "data that match their checksum", "hdf5.checksum");
-        }
-        heap.blocks[offset] = {address, size};
-    }
-
-    void indirect_block(Heap& heap, uint64_t address, uint64_t rows, uint64_t offset) {
-        Cursor c = cursor(address);
-        heap_block(heap, c, "FHIB", offset);
-        Cursor children = c.checked(rows * heap.width * 8);
-        for (uint64_t row = 0; row < rows; ++row) {
-            const uint64_t power = log2(heap.smallest) + (row == 0 ? 0 : row - 1);
-            c.expect(power < 64, "a heap below 2^64 bytes");
-            for (uint64_t column = 0; column < heap.width; ++column, offset += uint64_t{1} << power) {
-                const uint64_t child = children.number(8);
-                if (child == undefined_address) continue;
-                if (row < heap.direct_rows) {
-                    direct_block(heap, child, uint64_t{1} << power, offset);
-                    continue;
-                }
-                c.expect(row >= log2(heap.width), "a table smaller than the one it is in");
-                indirect_block(heap, child, row - log2(heap.width), offset);
+        Heap heap{(bits + 7) / 8, log2(std::min(most, largest)) / 8 + 1};
+        const auto block_of = [&](uint64_t at, const char* letters, std::optional<uint64_t> size, uint64_t offset) {
+            Cursor block = structure(at, letters, 0, size);
+            const bool same = block.number(8) == address && block.number(heap.offset_width) == offset;
+            block.expect(same,
+                         "a block of the heap at " + std::to_string(address) + ", offset " + std::to_string(offset));
+            return block;
+        };
+        const auto direct = [&](uint64_t at, uint64_t size, uint64_t offset) {
+            Cursor block = block_of(at, "FHDB", size, offset);
+            const Bytes all = cursor(at, size).take(size);
+            if ((flags & 2) != 0) {  // direct blocks have a checksum, which is taken with zeros in its own place
+                const uint64_t stored = block.number(4);
+                std::vector<uint8_t> covered(all.begin(), all.end());
+                std::fill_n(&covered[block.at - 4 - at], 4, uint8_t{0});
+                block.expect(stored == lookup3(covered), "data that match their checksum", "hdf5.checksum");
             }
-        }
+            heap.blocks[offset] = {at, size};
+        };
+        const auto indirect = [&](const auto& self, uint64_t at, uint64_t rows, uint64_t offset) -> void {
+            Cursor block = block_of(at, "FHIB", {}, offset);
+            Cursor children = block.checked(rows * width * 8);
+            for (uint64_t row = 0; row < rows; ++row) {
+                const uint64_t power = log2(smallest) + (row == 0 ? 0 : row - 1);
+                block.expect(power < 64, "a heap below 2^64 bytes");
+                for (uint64_t column = 0; column < width; ++column, offset += uint64_t{1} << power) {
+                    const uint64_t child = children.number(8);
+                    if (child == undefined_address) continue;
+                    block.expect(row < direct_rows || row >= log2(width), "a table smaller than the one it is in");
+                    if (row < direct_rows)
+                        direct(child, uint64_t{1} << power, offset);
+                    else
+                        self(self, child, row - log2(width), offset);
+                }
+            }
+        };
+        if (root != undefined_address && root_rows == 0) direct(root, smallest, 0);
+        if (root != undefined_address && root_rows > 0) indirect(indirect, root, root_rows, 0);
+        return heap;
     }
 
     // SPEC IV.A.2.c: many links lie in a heap, as the same messages, and a B-tree of type 5 has their places.
     //   message   0 | flags | [order 8] | heap 8 | B-tree 8 | ..         record   hash of the name 4 | heap ID
     //   heap ID   kind in bits 4 to 7 (0: in a block) | offset | length
-    void dense_links(std::vector<Link>& links, Cursor message) {
+    void dense_links(Links& links, Cursor message) {
         const auto [version, flags] = message.fields(1, 1);
         message.expect(version == 0, "a link information message of version 0");
         const auto [order, heap_address, tree] = message.fields((flags & 1) != 0 ? 8 : 0, 8, 8);
@@ -947,11 +886,8 @@ struct Hdf5Parser {
         });
     }
 
-    // --- Data sets
-
     // A data set in the making, and what is read of its header but not kept.
-    struct Grid {
-        Hdf5Dataset d;
+    struct Grid : Hdf5Dataset {
         Shape most;                // the extents to which the data set may grow; ~0: without limit
         uint64_t all = 1;          // chunks
         bool whole_edges = false;  // chunks that hang over the edge are not filtered
@@ -963,48 +899,46 @@ struct Hdf5Parser {
 
     void dataset(const std::string& path, const std::vector<Message>& header) {
         Grid g;
-        Hdf5Dataset& d = g.d;
-        d.path = path;
+        g.path = path;
         const auto each = [&](uint64_t type, const auto& read) {
             for (const Message& message : header) {
                 if (message.type != type) continue;
                 if ((message.flags & 2) != 0)
-                    d.unsupported = "its header shares a message with other objects";
+                    g.unsupported = "its header shares a message with other objects";
                 else
                     read(message.data);
             }
         };
         each(0x01, [&](Cursor c) { dataspace(g, c); });
-        each(0x03, [&](Cursor c) { datatype(d, c); });
-        each(0x07, [&](Cursor) { d.unsupported = "its data are in another file"; });
-        each(0x0B, [&](Cursor c) { filter_pipeline(d, c); });
-        if (d.element.kind == Hdf5Element::other && d.unsupported.empty())
-            d.unsupported = "elements of type " + d.type + " are not supported";
-        each(0x05, [&](Cursor c) { fill_value(d, c); });
+        each(0x03, [&](Cursor c) { datatype(g, c); });
+        each(0x07, [&](Cursor) { g.unsupported = "its data are in another file"; });
+        each(0x0B, [&](Cursor c) { filter_pipeline(g, c); });
+        if (g.element.kind == Hdf5Element::other && g.unsupported.empty())
+            g.unsupported = "elements of type " + g.type + " are not supported";
+        each(0x05, [&](Cursor c) { fill_value(g, c); });
         each(0x08, [&](Cursor c) {
-            charge(c.start, sizeof d + path.size());
-            c.expect(d.chunk_bytes == 0, "one layout message");
-            if (d.unsupported.empty()) layout(g, c);
+            charge(c.start, sizeof(Hdf5Dataset) + path.size());
+            c.expect(g.chunk_bytes == 0, "one layout message");
+            if (g.unsupported.empty()) layout(g, c);
         });
-        file.datasets.push_back(std::move(d));
+        file.datasets.push_back(std::move(g));
     }
 
     // SPEC IV.A.2.b: version | rank | flags | kind | [.. 4] | extents 8 each | [largest extents 8 each]
     void dataspace(Grid& g, Cursor c) {
-        Hdf5Dataset& d = g.d;
         const auto [version, rank, flags, kind] = c.fields(1, 1, 1, 1);
         c.expect((version == 1 || version == 2) && rank <= 32, "a data space of version 1 or 2, up to 32 dimensions");
         if (version == 1) c.take(4);
-        d.shape.resize(rank);
-        for (uint64_t& extent : d.shape) extent = c.number(8);
-        g.most = d.shape;
+        g.shape.resize(rank);
+        for (uint64_t& extent : g.shape) extent = c.number(8);
+        g.most = g.shape;
         for (uint64_t& extent : g.most) extent = (flags & 1) != 0 ? c.number(8) : extent;
-        if (version == 2 && kind == 2) d.shape = g.most = {0};  // no elements, no shape
-        d.elements = std::ranges::count(d.shape, 0) == 0 ? 1 : 0;
-        if (d.elements == 0) return;
+        if (version == 2 && kind == 2) g.shape = g.most = {0};  // no elements, no shape
+        g.elements = std::ranges::count(g.shape, 0) == 0 ? 1 : 0;
+        if (g.elements == 0) return;
         for (size_t k = 0; k < rank; ++k) {
-            d.elements = product(d.elements, d.shape[k], c.at);
-            c.expect(d.shape[k] <= g.most[k], "extents that are not above the largest allowed");
+            g.elements = product(g.elements, g.shape[k], c.at);
+            c.expect(g.shape[k] <= g.most[k], "extents that are not above the largest allowed");
         }
     }
 
@@ -1092,11 +1026,19 @@ struct Hdf5Parser {
     void layout(Grid& g, Cursor c) {
         const auto [version, kind] = c.fields(1, 1);
         if (version < 3 || version > 5 || kind > 2) {
-            g.d.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
+            g.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
             return;
         }
-        const uint64_t total = bounded(g.d.elements, g.d.element.size, c);
-        kind == 2 ? chunked(g, c, version) : one_run(g, c, kind == 0, total);
+        const uint64_t total = bounded(g.elements, g.element.size, c);
+        if (kind == 2) return chunked(g, c, version);
+        g.filters.clear();
+        g.chunk = g.shape;
+        g.chunk_bytes = total;
+        const auto [elsewhere, size] = c.fields(kind == 0 ? 0 : 8, kind == 0 ? 2 : 8);
+        const uint64_t address = kind == 0 ? c.at : elsewhere;
+        if (total == 0 || address == undefined_address) return;
+        c.expect(size >= total, std::to_string(total) + " bytes of data");
+        add(g, {}, {address, total, 0, 0}, c.start);
     }
 
     // Returns count * size, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are
@@ -1108,64 +1050,61 @@ struct Hdf5Parser {
         return total;
     }
 
-    void one_run(Grid& g, Cursor c, bool compact, uint64_t total) {
-        g.d.filters.clear();
-        g.d.chunk = g.d.shape;
-        g.d.chunk_bytes = total;
-        const auto [elsewhere, size] = compact ? c.fields(0, 2) : c.fields(8, 8);
-        const uint64_t address = compact ? c.at : elsewhere;
-        if (total == 0 || address == undefined_address) return;
-        c.expect(size >= total, std::to_string(total) + " bytes of data");
-        add(g, {}, {address, total, 0, 0}, c.start);
-    }
-
+    // The indexes of chunks (SPEC VII; III.A.1, node type 1; III.A.2, types 10 and 11).
+    //   B-tree 1   a key: the chunk's size 4, skipped filters 4, its first element 8 each
+    //   B-tree 2   a record: an entry (see index_entry), then the chunk's place 8 each
     void chunked(Grid& g, Cursor c, uint64_t version) {
-        Hdf5Dataset& d = g.d;
-        const size_t rank = d.shape.size();
+        const size_t rank = g.shape.size();
         const uint64_t flags = version == 3 ? 0 : c.number(1), extents = c.number(1);
         const uint64_t tree = version == 3 ? c.number(8) : 0, width = version == 3 ? 4 : c.number(1);
         c.expect(extents == rank + 1 && width >= 1 && width <= 8, "chunks of as many dimensions as the data");
-        d.chunk_bytes = d.element.size;
+        g.chunk_bytes = g.element.size;
         for (size_t k = 0; k < rank; ++k) {
-            d.chunk.push_back(c.number(width));
-            c.expect(d.chunk[k] > 0, "chunks that are not empty");
-            d.chunk_bytes = product(d.chunk_bytes, d.chunk[k], c.at);
-            d.counts.push_back(quotient(d.shape[k], d.chunk[k]));
-            g.all = d.elements == 0 ? 0 : product(g.all, d.counts[k], c.at);
+            g.chunk.push_back(c.number(width));
+            c.expect(g.chunk[k] > 0, "chunks that are not empty");
+            g.chunk_bytes = product(g.chunk_bytes, g.chunk[k], c.at);
+            g.counts.push_back(quotient(g.shape[k], g.chunk[k]));
+            g.all = g.elements == 0 ? 0 : product(g.all, g.counts[k], c.at);
         }
-        c.expect(c.number(width) == d.element.size, "chunks of the data's elements");
-        bounded(g.all, d.chunk_bytes, c);
+        c.expect(c.number(width) == g.element.size, "chunks of the data's elements");
+        bounded(g.all, g.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
-        if (d.elements == 0) return;
+        if (g.elements == 0) return;
+        Shape place(rank);
+        if (version == 3 && tree == undefined_address) return;
         if (version == 3)
-            b_tree_1_index(g, tree);
-        else
-            chunk_index(g, c, (flags & 2) != 0);
-    }
-
-    // SPEC VII. `filtered` matters for a single chunk alone; the parameters of the others are repeated in the index.
-    void chunk_index(Grid& g, Cursor c, bool filtered) {
-        const size_t rank = g.d.shape.size();
+            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t chunk) {
+                const auto [size, skipped] = key.fields(4, 4);
+                for (size_t k = 0; k < rank; ++k) {
+                    const uint64_t first = key.number(8);
+                    key.expect(first % g.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
+                    place[k] = first / g.chunk[k];
+                }
+                add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
+            });
         const uint64_t index = c.number(1);
         c.expect(index >= 1 && index <= 5, "a chunk index of type 1 to 5");
-        Hdf5Chunk single{0, g.d.chunk_bytes, 0, 0};
-        if (index == 1 && filtered) {
-            single.size = c.number(8);
-            single.skipped = static_cast<uint32_t>(c.number(4));
-        }
+        const bool alone = index == 1 && (flags & 2) != 0;  // a filtered chunk; other indexes repeat their parameters
+        const auto [stored, skipped] = c.fields(alone ? 8 : 0, alone ? 4 : 0);
         constexpr uint64_t parameters[] = {0, 0, 0, 1, 5, 6};  // bytes, by index type
         c.take(parameters[index]);
-        single.address = c.number(8);
-        if (single.address == undefined_address) return;
-        if (index == 1) return add(g, Shape(rank, 0), single, c.start);
-        if (index == 5) return b_tree_2_index(g, single.address);
+        const uint64_t address = c.number(8);
+        if (address == undefined_address) return;
+        if (index == 1)
+            return add(g, place, {address, alone ? stored : g.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
+        if (index == 5)
+            return b_tree_2(address, g.filters.empty() ? 10 : 11, [&](Cursor record) {
+                const Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
+                for (uint64_t& coordinate : place) coordinate = record.number(8);
+                add(g, place, chunk, record.start);
+            });
         for (size_t k = 0; k < rank; ++k)
             g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
         g.step.assign(rank, 1);
         for (size_t k = rank; k-- > 1;)
-            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.d.chunk[g.order[k]]), c.at);
-        if (index == 2) return implicit_index(g, single.address);
-        index == 3 ? fixed_array(g, single.address) : extensible_array(g, single.address);
+            g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.chunk[g.order[k]]), c.at);
+        if (index == 2) return implicit_index(g, address);
+        index == 3 ? fixed_array(g, address) : extensible_array(g, address);
     }
 
     // `place`: which chunk, in each dimension. Those beyond the edge are left over from when the data set was larger.
@@ -1173,48 +1112,23 @@ struct Hdf5Parser {
         if (chunk.address == undefined_address) return;
         bool partial = false;
         for (size_t k = 0; k < place.size(); ++k) {
-            if (place[k] >= g.d.counts[k]) return;
-            chunk.place = chunk.place * g.d.counts[k] + place[k];
-            partial = partial || g.d.shape[k] - place[k] * g.d.chunk[k] < g.d.chunk[k];
+            if (place[k] >= g.counts[k]) return;
+            chunk.place = chunk.place * g.counts[k] + place[k];
+            partial = partial || g.shape[k] - place[k] * g.chunk[k] < g.chunk[k];
         }
         if (g.whole_edges && partial) chunk.skipped = ~0u;
-        if (g.d.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
+        if (g.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
         require_inside(chunk.address, chunk.size);
         charge(offset, sizeof chunk);
-        g.d.chunks.push_back(chunk);
-        g.d.stored += chunk.size;
-    }
-
-    // SPEC III.A.1, node type 1. A key: the chunk's size 4, skipped filters 4, its first element 8 each.
-    void b_tree_1_index(Grid& g, uint64_t address) {
-        Shape place(g.d.shape.size());
-        if (address == undefined_address) return;
-        b_tree_1(address, 1, 16 + 8 * place.size(), [&](Cursor key, uint64_t chunk) {
-            const auto [size, skipped] = key.fields(4, 4);
-            for (size_t k = 0; k < place.size(); ++k) {
-                const uint64_t first = key.number(8);
-                key.expect(first % g.d.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
-                place[k] = first / g.d.chunk[k];
-            }
-            add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
-        });
-    }
-
-    // SPEC VII.E; III.A.2, types 10 and 11. A record: an entry as below, then the chunk's place 8 each.
-    void b_tree_2_index(Grid& g, uint64_t address) {
-        Shape place(g.d.shape.size());
-        b_tree_2(address, g.d.filters.empty() ? 10 : 11, [&](Cursor c) {
-            const Hdf5Chunk chunk = index_entry(g, c, c.end - c.at - 8 * place.size());
-            for (uint64_t& coordinate : place) coordinate = c.number(8);
-            add(g, place, chunk, c.start);
-        });
+        g.chunks.push_back(chunk);
+        g.stored += chunk.size;
     }
 
     // An entry of an index has `size` bytes: address 8, and with filters the chunk's size 1..8 and those skipped 4.
     static Hdf5Chunk index_entry(const Grid& g, Cursor& c, uint64_t size) {
-        const bool filtered = !g.d.filters.empty();
+        const bool filtered = !g.filters.empty();
         c.expect(filtered ? size > 12 && size <= 20 : size == 8, "entries of 8 bytes, or with filters of 13 to 20");
-        const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.d.chunk_bytes;
+        const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.chunk_bytes;
         return {address, stored, 0, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
     }
 
@@ -1223,10 +1137,10 @@ struct Hdf5Parser {
         Shape place(g.order.size());
         for (uint64_t i = 0; i < g.all; ++i) {
             uint64_t number = 0, rest = i;
-            for (size_t k = place.size(); k-- > 0; rest /= g.d.counts[k]) place[k] = rest % g.d.counts[k];
+            for (size_t k = place.size(); k-- > 0; rest /= g.counts[k]) place[k] = rest % g.counts[k];
             for (size_t k = 0; k < place.size(); ++k) number += place[g.order[k]] * g.step[k];
-            const uint64_t begin = address + product(number, g.d.chunk_bytes, address);
-            add(g, place, {begin, g.d.chunk_bytes, 0, 0}, address);
+            const uint64_t begin = address + product(number, g.chunk_bytes, address);
+            add(g, place, {begin, g.chunk_bytes, 0, 0}, address);
         }
     }
 
@@ -1235,13 +1149,11 @@ struct Hdf5Parser {
     // and hold `count` entries from number `first` on, in pages (each with a checksum) if they are more than a page.
     struct EntryArray {
         uint64_t address, size, page;  // of the header; bytes of an entry; entries of a page
-        uint64_t used;                 // 1 + the highest number stored
     };
 
-    Cursor array_block(const Grid& g, uint64_t address, std::string_view letters, uint64_t header) {
-        Cursor c = cursor(address);
-        c.begins(letters, 0);
-        c.expect(c.number(1) == (g.d.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
+    Cursor array_block(const Grid& g, uint64_t address, const std::string& letters, uint64_t header) {
+        Cursor c = structure(address, letters, 0);
+        c.expect(c.number(1) == (g.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
         c.expect(header == 0 || c.number(8) == header, "a block of the index at " + std::to_string(header));
         return c;
     }
@@ -1259,16 +1171,24 @@ struct Hdf5Parser {
         }
     }
 
-    // `written`: a bit for each page, the highest of a byte first; page 0 has bit number `bit`.
-    void pages(Grid& g, const EntryArray& array, uint64_t address, uint64_t first, uint64_t count, Bytes written,
-               uint64_t bit) {
+    // Reads a data block of `count` entries. `written`: a bit for each page, the highest of a byte first; page 0 has
+    // bit number `bit`. These bits are in a secondary block, or, if there is none, at the block's beginning.
+    void data_block(Grid& g, const EntryArray& array, const std::string& letters, uint64_t address, uint64_t prefix,
+                    uint64_t first, uint64_t count, Bytes written, uint64_t bit) {
+        Cursor c = array_block(g, address, letters, array.address);
+        const bool paged = count > array.page;
+        Cursor body = c.checked(prefix + (paged ? 0 : product(array.size, count, address)));
+        const Bytes before = body.take(prefix);
+        if (!paged) return entries(g, array, body, first, count);
+        if (written.empty()) written = before;
+        uint64_t page = c.at;
         for (uint64_t done = 0; done < count; ++bit) {
-            const uint64_t here = std::min(array.page, count - done), bytes_here = product(here, array.size, address);
+            const uint64_t here = std::min(array.page, count - done), bytes_here = product(here, array.size, page);
             if ((written[bit / 8] << (bit % 8) & 0x80) != 0) {
-                Cursor c = cursor(address).checked(bytes_here);
-                entries(g, array, c, first + done, here);
+                Cursor entry = cursor(page).checked(bytes_here);
+                entries(g, array, entry, first + done, here);
             }
-            address += bytes_here + 4;
+            page += bytes_here + 4;
             done += here;
         }
     }
@@ -1282,15 +1202,8 @@ struct Hdf5Parser {
         c.checksum();
         c.expect(page_bits < 64, "pages below 2^64 entries");
         if (block == undefined_address) return;
-        const EntryArray array{address, size, uint64_t{1} << page_bits, count};
-        Cursor data = array_block(g, block, "FADB", address);
-        if (count <= array.page) {
-            Cursor body = data.checked(product(size, count, block));
-            return entries(g, array, body, 0, count);
-        }
-        const uint64_t bitmap = quotient(quotient(count, array.page), 8);
-        const Bytes written = data.checked(bitmap).take(bitmap);
-        pages(g, array, data.at, 0, count, written, 0);
+        const uint64_t page = uint64_t{1} << page_bits, bitmap = quotient(quotient(count, page), 8);
+        data_block(g, {address, size, page}, "FADB", block, count > page ? bitmap : 0, 0, count, {}, 0);
     }
 
     // SPEC VII.D. Entries lie in the index block (the first few), in data blocks to which it points, and in data blocks
@@ -1311,7 +1224,7 @@ struct Hdf5Parser {
         c.expect(powers && log2(least) <= bits && bits <= 48 && page_bits < 48,
                  "an index of at most 2^48 chunks in blocks of powers of two");
         if (block == undefined_address) return;
-        const EntryArray array{address, size, uint64_t{1} << page_bits, used};
+        const EntryArray array{address, size, uint64_t{1} << page_bits};
         const uint64_t levels = 1 + bits - log2(least), in_index = std::min(levels, 2 * log2(pointers));
         const uint64_t offset_width = (bits + 7) / 8;
         Cursor index = array_block(g, block, "EAIB", address)
@@ -1321,33 +1234,23 @@ struct Hdf5Parser {
         for (uint64_t u = 0; u < levels && first < used; ++u) {
             const uint64_t blocks = uint64_t{1} << (u / 2), count = (uint64_t{1} << ((u + 1) / 2)) * least;
             const uint64_t n_pages = count > array.page ? count / array.page : 0;
+            const auto data_blocks = [&](Cursor& addresses, Bytes written) {
+                for (uint64_t b = 0; b < blocks; ++b)
+                    if (const uint64_t at = addresses.number(8); at != undefined_address && first + b * count < used)
+                        data_block(g, array, "EADB", at, offset_width, first + b * count, count, written, b * n_pages);
+            };
             if (u < in_index) {
                 index.expect(n_pages == 0, "pages only below secondary blocks");
-                for (uint64_t b = 0; b < blocks; ++b)
-                    data_block(g, array, index.number(8), offset_width, first + b * count, count, {}, 0);
+                data_blocks(index, {});
             } else if (const uint64_t secondary = index.number(8); secondary != undefined_address) {
                 const uint64_t bitmap = blocks * quotient(n_pages, 8);
                 Cursor s = array_block(g, secondary, "EASB", address).checked(offset_width + bitmap + 8 * blocks);
                 s.take(offset_width);
                 const Bytes written = s.take(bitmap);
-                for (uint64_t b = 0; b < blocks; ++b)
-                    data_block(g, array, s.number(8), offset_width, first + b * count, count, written, b * n_pages);
+                data_blocks(s, written);
             }
             first += blocks * count;
         }
-    }
-
-    void data_block(Grid& g, const EntryArray& array, uint64_t address, uint64_t offset_width, uint64_t first,
-                    uint64_t count, Bytes written, uint64_t bit) {
-        if (address == undefined_address || first >= array.used) return;
-        Cursor c = array_block(g, address, "EADB", array.address);
-        const bool paged = count > array.page;
-        Cursor body = c.checked(offset_width + (paged ? 0 : count * array.size));
-        body.take(offset_width);
-        if (paged)
-            pages(g, array, c.at, first, count, written, bit);
-        else
-            entries(g, array, body, first, count);
     }
 };
 
@@ -1372,57 +1275,36 @@ inline Hdf5File open_hdf5(const std::string& path) {
 //   | superblock | data | data | ... | header of a data set | ... | names, heap, node, tree, header of a group | ...
 //
 //   Hdf5Writer file("out.hdf5");
-//   file.add("actions", {n, 3}, actions);     any vector, array or span; or, for data that come in parts:
-//   file.begin<float>("observations", {n, 11}), file.append(part1), file.append(part2), ...
+//   file.add("infos/qpos", {n, 3}, positions);   a vector, array or span; groups come into being with what they hold
 //   file.text("metadata/algorithm", "SAC");
-//   file.close();                                                     without it no file appears
+//   file.close();                                without it no file appears
 class Hdf5Writer {
   public:
     explicit Hdf5Writer(const std::string& path) : file_(path) { put(std::string(superblock_size, '\0')); }
 
-    // T: float, double, int32_t, or uint8_t for booleans (0 or 1). Groups come into being with what they hold.
-    // Errors: hdf5.name, hdf5.shape (also if the data set before is not complete).
-    template <class T>
-    void begin(const std::string& name, const Shape& shape) {
-        begin_raw(name, shape, std::string(type_of<T>()), sizeof(T));
-    }
-
-    // Adds the next elements, row-major, of the type given to begin. Errors: hdf5.shape, hdf5.flag.
+    // Elements, row-major: float, double, int32_t, or uint8_t for booleans (0 or 1).
+    // Errors: hdf5.name, hdf5.shape, hdf5.flag, file.write.
     template <std::ranges::contiguous_range Range>
-    void append(const Range& range) {
+    void add(const std::string& name, const Shape& shape, const Range& range) {
         const std::span data(range);
         using T = std::ranges::range_value_t<Range>;
-        if (type_ != type_of<T>() || data.size_bytes() > missing_)
-            refuse("hdf5.shape", std::to_string(data.size_bytes()) + " bytes are more than the " +
-                                     std::to_string(missing_) + " that its shape leaves, or of another type");
         if constexpr (std::is_same_v<T, uint8_t>)
             if (std::ranges::any_of(data, [](uint8_t flag) { return flag > 1; }))
-                refuse("hdf5.flag", "a flag is neither 0 nor 1");
-        put({reinterpret_cast<const char*>(data.data()), data.size_bytes()});
-        missing_ -= data.size_bytes();
+                fail_dataset("hdf5.flag", file_.path, name, "a flag is neither 0 nor 1");
+        add_raw(name, shape, type_of<T>(), sizeof(T), {reinterpret_cast<const char*>(data.data()), data.size_bytes()});
     }
 
-    template <std::ranges::contiguous_range Range>
-    void add(const std::string& name, const Shape& shape, const Range& data) {
-        begin<std::ranges::range_value_t<Range>>(name, shape);
-        append(data);
-    }
-
-    // Writes a scalar string of fixed length, filled up with NULs.
+    // Writes a scalar string of fixed length. HDF5 has no empty types: an empty string becomes one NUL.
     void text(const std::string& name, const std::string& text) {
-        const size_t size = std::max<size_t>(text.size(), 1);  // HDF5 has no empty types
-        begin_raw(name, {}, std::string("\x13\1\0\0", 4) + little(size, 4), size);
-        put(text + std::string(size - text.size(), '\0'));
-        missing_ = 0;
+        const std::string stored = text.empty() ? std::string(1, '\0') : text;
+        add_raw(name, {}, std::string("\x13\1\0\0", 4) + little(stored.size(), 4), stored.size(), stored);
     }
 
     void close() {
-        finish();
         const std::string root = group(root_);
         const std::string start = "\x89HDF\r\n\x1a\n" + std::string(5, '\0') + "\x08\x08" + '\0' + little(leaf_k_, 2) +
                                   little(tree_k, 2) + little(0, 4 + 8) + none + little(position_, 8) + none +
                                   little(0, 8) + root;  // SPEC II.A, version 0
-        flush();
         if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.temporary);
         file_.write(start);
         file_.commit();
@@ -1434,7 +1316,7 @@ class Hdf5Writer {
         std::string header;                    // of a data set
     };
 
-    static constexpr size_t superblock_size = 96, tree_k = 16, buffer_size = 1 << 20;
+    static constexpr size_t superblock_size = 96, tree_k = 16;
     inline static const std::string none = std::string(8, '\xFF');  // the undefined address
 
     // SPEC IV.A.2.d: a datatype message's class, flags, size and properties, as Hdf5Parser::datatype describes them.
@@ -1448,25 +1330,14 @@ class Hdf5Writer {
             return "\x18\2\0\0\1\0\0\0\x10\x08\0\0\1\0\0\0\0\0\x08\0FALSE\0\0\0TRUE\0\0\0\0\0\1"sv;
     }  // any other type does not compile: no return
 
-    [[noreturn]] void refuse(const char* id, const std::string& why) const {
-        fail(id, "%s: %s: %s", file_.path.c_str(), json_string(name_).c_str(), why.c_str());
-    }
     static std::string little(uint64_t value, size_t size) {  // least significant byte first
         std::string bytes(size, '\0');
         std::memcpy(bytes.data(), &value, std::min<size_t>(size, 8));
         return bytes;
     }
     void put(std::string_view bytes) {
-        if (buffer_.size() + bytes.size() > buffer_size) flush();
-        if (bytes.size() > buffer_size)
-            file_.write(bytes);
-        else
-            buffer_ += bytes;
+        file_.write(bytes);
         position_ += bytes.size();
-    }
-    void flush() {
-        file_.write(buffer_);
-        buffer_.clear();
     }
     // Puts the bytes at a multiple of 8 and returns their address.
     uint64_t place(std::string_view bytes) {
@@ -1485,23 +1356,27 @@ class Hdf5Writer {
         return little(1, 2) + little(messages.size(), 2) + little(1, 4) + little(body.size(), 4) + little(0, 4) + body;
     }
 
-    void begin_raw(const std::string& name, const Shape& shape, const std::string& type, size_t element_size) {
-        finish();
-        name_ = name;
-        type_ = type;
-        missing_ = element_size;
+    void add_raw(const std::string& name, const Shape& shape, std::string_view type, size_t size,
+                 std::string_view data) {
         std::string space = little(1, 1) + little(shape.size(), 1) + little(0, 6);
-        for (const uint64_t extent : shape) {
-            if (__builtin_mul_overflow(missing_, extent, &missing_) || shape.size() > 32)
-                refuse("hdf5.shape", "shape " + shape_text(shape) + " is too large");
+        for (const uint64_t extent : shape) {  // `size`: of an element, then of all
+            if (__builtin_mul_overflow(size, extent, &size) || shape.size() > 32)
+                fail_dataset("hdf5.shape", file_.path, name, "shape " + shape_text(shape) + " is too large");
             space += little(extent, 8);
         }
         Node& node = new_node(name);
-        const uint64_t address = missing_ == 0 ? undefined_address : place("");
-        node.header = header({{0x01, space},                                                // SPEC IV.A.2.b
-                              {0x03, type},                                                 // IV.A.2.d
-                              {0x05, little(0x01'02'02'02, 4) + little(0, 4)},              // IV.A.2.f: zeros
-                              {0x08, "\3\1" + little(address, 8) + little(missing_, 8)}});  // IV.A.2.i
+        if (data.size() > size)
+            fail_dataset("hdf5.shape", file_.path, name,
+                         std::to_string(data.size()) + " bytes are more than the " + std::to_string(size) +
+                             " that its shape leaves");
+        if (data.size() < size)
+            fail_dataset("hdf5.shape", file_.path, name,
+                         std::to_string(size - data.size()) + " bytes fewer were given than its shape has");
+        const uint64_t address = size == 0 ? undefined_address : place(data);
+        node.header = header({{0x01, space},                                            // SPEC IV.A.2.b
+                              {0x03, std::string(type)},                                // IV.A.2.d
+                              {0x05, little(0x01'02'02'02, 4) + little(0, 4)},          // IV.A.2.f: zeros
+                              {0x08, "\3\1" + little(address, 8) + little(size, 8)}});  // IV.A.2.i
     }
 
     // Finds or makes the groups that the name passes through. Errors: hdf5.name.
@@ -1514,16 +1389,13 @@ class Hdf5Writer {
             const bool in_use = !child.header.empty() || (end == name.size() && !child.children.empty());
             const bool no_name = part.empty() || part == "." || !is_utf8(part) || has_control(part);
             if (in_use || no_name || node->children.size() > 65535)
-                refuse("hdf5.name", "cannot name a data set: a part of it is in use or is no name");
+                fail_dataset("hdf5.name", file_.path, name,
+                             "cannot name a data set: a part of it is in use or is no name");
             leaf_k_ = std::max(leaf_k_, (node->children.size() + 1) / 2);
             node = &child;
             at = end + 1;
         }
         return *node;
-    }
-
-    void finish() const {
-        if (missing_ > 0) refuse("hdf5.shape", std::to_string(missing_) + " bytes fewer were given than its shape has");
     }
 
     // Writes what the group holds, then itself: its names, heap, symbol node, a tree of this one node, object header,
@@ -1551,10 +1423,7 @@ class Hdf5Writer {
     }
 
     AtomicFile file_;
-    std::string buffer_;
     uint64_t position_ = 0;  // bytes put
     Node root_;
-    size_t leaf_k_ = 4;        // half the number of entries in a symbol node of any group: one node must do
-    std::string name_, type_;  // of the data set being written
-    size_t missing_ = 0;       // bytes
+    size_t leaf_k_ = 4;  // half the number of entries in a symbol node of any group: one node must do
 };

@@ -7,19 +7,7 @@
 // Leaves out: numpy's random numbers, so a set agrees with D4RL's in distribution, not row by row; files.
 #pragma once
 
-#include <algorithm>
-#include <array>
-#include <cmath>
-#include <cstdint>
-#include <functional>
-#include <optional>
-#include <string_view>
-#include <utility>
-#include <vector>
-
-#include "../memory.hpp"
 #include "../mujoco_env.hpp"
-#include "../nn.hpp"
 #include "rows.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -32,22 +20,18 @@ struct MazeGrid {
     std::vector<MazeCell> open;  // the cells that starts and targets are drawn from, D4RL's order: free ones, the goal
     std::vector<std::array<int, maze_moves.size()>> next;  // [rows * columns][move] where a move leads
 
-    explicit MazeGrid(std::string_view map) {
-        for (const MazeCell cell : cells_marked(map, '1')) {  // the outermost cells are walls
-            rows = std::max(rows, cell.row + 1);
-            columns = std::max(columns, cell.column + 1);
-        }
-        open = cells_marked(map, '0');
-        for (const MazeCell goal : cells_marked(map, 'G')) open.push_back(goal);
-        std::vector<bool> enterable(rows * columns);
-        for (const MazeCell cell : open) enterable[number(cell)] = true;
+    explicit MazeGrid(std::string_view map) : open(cells_marked(map, '0')) {
+        columns = static_cast<int>(map.find('/'));
+        rows = static_cast<int>(map.size()) / (columns + 1);
+        append_all(open, cells_marked(map, 'G'));
         // A move into a wall or off the map stays in its cell. A plan may start in a wall: the ball comes as near as
         // 0.4 to a wall's centre, so its rounded position can be one, from which free neighbours can be entered.
-        next.resize(enterable.size());
+        next.resize(rows * columns);
         for (int from = 0; from < rows * columns; ++from)
             for (size_t move = 0; move < maze_moves.size(); ++move) {
                 const MazeCell to{cell(from).row + maze_moves[move].row, cell(from).column + maze_moves[move].column};
-                next[from][move] = contains(to.row, to.column) && enterable[number(to)] ? number(to) : from;
+                const bool enters = contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
+                next[from][move] = enters ? number(to) : from;
             }
     }
 
@@ -59,10 +43,6 @@ struct MazeGrid {
 // ---------------------------------------------------------------------------------------------------------------------
 // The planner.
 
-constexpr int planner_sweeps = 50;
-constexpr double planner_discount = 0.99;
-constexpr int planner_moves = 100;  // at most, in a plan
-
 using MazeValues = std::vector<std::array<double, maze_moves.size()>>;  // Q [rows * columns][move]
 
 // Exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0, with R = 1 in the target and 0
@@ -71,11 +51,11 @@ using MazeValues = std::vector<std::array<double, maze_moves.size()>>;  // Q [ro
 inline MazeValues maze_values(const MazeGrid& grid, int target) {
     MazeValues q(grid.next.size());
     std::vector<double> v(q.size());  // max_b Q(s, b) of the sweep before
-    for (int sweep = 0; sweep < planner_sweeps; ++sweep) {
-        for (size_t s = 0; s < q.size(); ++s) v[s] = *std::max_element(q[s].begin(), q[s].end());
+    for (int sweep = 0; sweep < 50; ++sweep) {
+        for (size_t s = 0; s < q.size(); ++s) v[s] = std::ranges::max(q[s]);
         for (size_t s = 0; s < q.size(); ++s)
             for (size_t move = 0; move < maze_moves.size(); ++move)
-                q[s][move] = (static_cast<int>(s) == target ? 1.0 : 0.0) + planner_discount * v[grid.next[s][move]];
+                q[s][move] = (static_cast<int>(s) == target ? 1.0 : 0.0) + 0.99 * v[grid.next[s][move]];
     }
     return q;
 }
@@ -84,12 +64,12 @@ inline MazeValues maze_values(const MazeGrid& grid, int target) {
 // target itself the path is the target. If no path leads to the target, it is 100 times the start.
 inline std::vector<int> greedy_path(const MazeGrid& grid, const MazeValues& q, int start, int target) {
     std::vector<int> path;
-    for (int cell = start; static_cast<int>(path.size()) < planner_moves;) {
-        const auto best = std::max_element(q[cell].begin(), q[cell].end()) - q[cell].begin();  // the first of equals
+    int cell = start;
+    do {
+        const auto best = std::ranges::max_element(q[cell]) - q[cell].begin();  // the first of equals
         cell = grid.next[cell][best];
         path.push_back(cell);
-        if (cell == target) break;
-    }
+    } while (cell != target && path.size() < 100);
     return path;
 }
 
@@ -99,8 +79,13 @@ inline std::vector<int> greedy_path(const MazeGrid& grid, const MazeValues& q, i
 using MazePoint = std::array<double, 2>;  // x, y
 
 inline double maze_distance(MazePoint a, MazePoint b) { return std::hypot(a[0] - b[0], a[1] - b[1]); }
-inline MazePoint whole_point(MazeCell cell) {
-    return {static_cast<double>(cell.row), static_cast<double>(cell.column)};
+inline MazePoint whole_point(MazeCell cell) { return {double(cell.row), double(cell.column)}; }
+
+// Returns the point plus uniform [low, low + width) per coordinate. `site`: of the draw for x; the next one is for y.
+inline MazePoint scattered(MazePoint point, double low, double width, const Random& random, uint64_t step,
+                           uint32_t index, uint32_t site) {
+    for (uint32_t i = 0; i < 2; ++i) point[i] += low + width * random.uniform(step, index, site + i);
+    return point;
 }
 
 // The sites of the draws from Stream::data_set: each stands for x, and the next number for y.
@@ -161,11 +146,10 @@ struct WaypointController {
         if (q.empty()) q = maze_values(grid, end);
         waypoints.clear();
         for (const int cell : greedy_path(grid, q, start, end)) {
-            MazePoint point = whole_point(grid.cell(cell));
+            const MazePoint centre = whole_point(grid.cell(cell));
             const uint32_t move = static_cast<uint32_t>(waypoints.size());
-            for (uint32_t i = 0; i < 2 && cell != end; ++i)
-                point[i] -= scatter * random.uniform(plans, move, MazeDraw::waypoint + i);
-            waypoints.push_back(point);
+            waypoints.push_back(cell == end ? centre
+                                            : scattered(centre, 0, -scatter, random, plans, move, MazeDraw::waypoint));
         }
         at = 0;
         target = to;
@@ -197,9 +181,8 @@ inline MazeGrid maze2d_grid(const MujocoTask& task) {
 
 // Target `number`: a free cell or the goal's, plus uniform [-0.1, 0.1) per coordinate.
 inline MazePoint draw_maze_target(const MazeGrid& grid, const Random& random, uint64_t number) {
-    MazePoint target = whole_point(grid.open[random.below(grid.open.size(), number, 0, MazeDraw::target_cell)]);
-    for (uint32_t i = 0; i < 2; ++i) target[i] += 0.2 * random.uniform(number, 0, MazeDraw::target_place + i) - 0.1;
-    return target;
+    const MazeCell cell = grid.open[random.below(grid.open.size(), number, 0, MazeDraw::target_cell)];
+    return scattered(whole_point(cell), -0.1, 0.2, random, number, 0, MazeDraw::target_place);
 }
 
 // With --noisy D4RL's script adds this times a standard normal to every action and clips again. The published files'

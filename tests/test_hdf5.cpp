@@ -21,8 +21,7 @@ struct Folder {
 // tests/hdf5/NAME.z: the size, then a zlib stream.
 std::string fixture(const std::string& name) {
     const std::string packed = read_file("tests/hdf5/" + name + ".z");
-    std::vector<uint8_t> bytes(little_endian(as_bytes(packed).first(8)));
-    inflate_zlib(as_bytes(packed).subspan(8), bytes);
+    const auto bytes = inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8)));
     return std::string(bytes.begin(), bytes.end());
 }
 
@@ -34,8 +33,8 @@ Hdf5File parse(const std::string& bytes) {
 // One string of fixed length, without the NULs or spaces that fill it up.
 std::string read_text(const Hdf5File& file, const Hdf5Dataset& dataset) {
     CHECK(dataset.unsupported.empty() && dataset.element.kind == Hdf5Element::text && dataset.elements == 1);
-    std::array<std::vector<uint8_t>, 2> buffers;
-    const Bytes found = dataset.chunks.empty() ? dataset.fill : file.decode(dataset, dataset.chunks.at(0), buffers);
+    std::vector<uint8_t> buffer;
+    const Bytes found = dataset.chunks.empty() ? dataset.fill : file.decode(dataset, dataset.chunks.at(0), buffer);
     std::string text(found.begin(), std::ranges::find(found, 0));
     text.resize(text.find_last_not_of(' ') + 1);
     return text;
@@ -86,9 +85,9 @@ bool survives(const std::string& bytes) {
         const Hdf5File file = parse(bytes);
         for (const Hdf5Dataset& dataset : file.datasets) {
             try {
-                std::array<std::vector<uint8_t>, 2> buffers;
+                std::vector<uint8_t> buffer;
                 for (const Hdf5Chunk& chunk : dataset.chunks)
-                    if (dataset.unsupported.empty()) file.decode(dataset, chunk, buffers);
+                    if (dataset.unsupported.empty()) file.decode(dataset, chunk, buffer);
                 if (dataset.element.kind != Hdf5Element::text && file.read_floats(dataset).size() != dataset.elements)
                     return false;
             } catch (const Error& error) {
@@ -135,14 +134,13 @@ std::string unhex(const std::string& digits) {
 
 // What is wrong with a stream; empty if it gives the expected bytes.
 std::string complaint(const std::string& stream, const std::string& expected) {
-    std::string out(expected.size(), '?');
     try {
-        inflate_zlib(as_bytes(stream), std::span(reinterpret_cast<uint8_t*>(out.data()), out.size()));
+        return std::ranges::equal(inflate_zlib(as_bytes(stream), expected.size()), as_bytes(expected)) ? ""
+                                                                                                       : "other bytes";
     } catch (const Error& error) {
         CHECK_EQUAL(error.id, "hdf5.deflate");
         return error.what();
     }
-    return out == expected ? "" : "other bytes";
 }
 bool inflates_to(const std::string& stream, const std::string& expected) { return complaint(stream, expected).empty(); }
 
@@ -399,7 +397,7 @@ TEST(hdf5_files_changed_at_random_give_errors_or_values) {
 TEST(hdf5_writer_makes_files_that_the_reader_reads) {
     const Folder folder;
     const std::string path = folder / "out.hdf5";
-    const size_t n = 300001;  // above the buffer's size
+    const size_t n = 300001;
     std::vector<float> floats(3 * n);
     std::vector<double> doubles(2 * n);
     std::vector<int32_t> integers(n);
@@ -411,9 +409,7 @@ TEST(hdf5_writer_makes_files_that_the_reader_reads) {
     const auto write = [&] {
         Hdf5Writer out(path);
         out.add("observations", {n, 3}, floats);
-        out.begin<double>("infos/qpos", {n, 2});
-        for (size_t at = 0; at < 2 * n; at += 777)
-            out.append(std::span<const double>(doubles).subspan(at, std::min<size_t>(777, 2 * n - at)));
+        out.add("infos/qpos", {n, 2}, doubles);
         out.add("infos/steps", {n}, integers);
         out.add("terminals", {n}, flags);
         out.add("none", {0, 3}, std::vector<float>());
@@ -451,11 +447,8 @@ TEST(hdf5_writer_refuses_what_does_not_fit) {
     const std::vector<uint8_t> flags = {0, 1, 2};
     const auto add = [&](Hdf5Writer& out, const std::string& name, const Shape& shape) { out.add(name, shape, three); };
     CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {2}));
-    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {4}); out.close());
-    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {4}); add(out, "b", {3}));
+    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {4}));
     CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); add(out, "a", {uint64_t{1} << 40, uint64_t{1} << 40}));
-    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); out.begin<double>("a", {3}); out.append(three));
-    CHECK_FAILS("hdf5.shape", Hdf5Writer out(path); out.begin<int32_t>("a", {3}); out.append(three));
     CHECK_FAILS("hdf5.flag", Hdf5Writer out(path); out.add("a", {3}, flags));
     for (const char* name : {"", "/a", "a/", "a//b", "x", "x/y", "g", ".", "\xFF", "a\n"}) {
         CHECK_FAILS("hdf5.name", Hdf5Writer out(path); add(out, "x", {3}); add(out, "g/y", {3}); add(out, name, {3}));
