@@ -17,7 +17,6 @@
 #include <map>
 #include <memory>
 #include <optional>
-#include <set>
 #include <span>
 #include <string>
 #include <string_view>
@@ -50,11 +49,22 @@ inline std::string trimmed(std::string_view text) {
     return std::string(text.substr(first, text.find_last_not_of(" \t") + 1 - first));
 }
 
-// The shortest text that reads back as the same number; Number is float or double.
+// The shortest text that reads back as the same number; Number is any type of numbers.
 template <class Number>
 std::string number_text(Number x) {
     char text[32];
     return {text, std::to_chars(text, text + sizeof text, x).ptr};
+}
+
+// A text as it is; yes or no; or number_text().
+template <class Value>
+std::string value_text(const Value& value) {
+    if constexpr (std::is_same_v<Value, bool>)
+        return value ? "yes" : "no";
+    else if constexpr (std::is_arithmetic_v<Value>)
+        return number_text(value);
+    else
+        return value;
 }
 
 // A finite number that takes up the whole text, or nothing.
@@ -85,6 +95,18 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
     return *std::min_element(names.begin(), names.end(), [&](const std::string& a, const std::string& b) {
         return edit_distance(name, a) < edit_distance(name, b);
     });
+}
+
+// The row of a table that has this name. `sentence` is a format of two texts: the name, and the nearest one.
+// Errors: `id`, if there is none.
+template <class Rows>
+const auto& row_named(const Rows& rows, const std::string& name, const char* id, const std::string& sentence) {
+    std::vector<std::string> names;
+    for (const auto& row : rows) {
+        if (name == row.name) return row;
+        names.push_back(row.name);
+    }
+    fail(id, sentence.c_str(), name.c_str(), nearest_name(name, names).c_str());
 }
 
 // The index of `name` among an enumeration's names, which hold it.
@@ -213,114 +235,77 @@ inline const SettingRow setting_rows[] = {
 };
 
 // What the D4RL tasks change; later rows override earlier ones. A row holds for tasks whose name begins with `task` and
-// for `method`; "" stands for all. ODT's paper prints no such table: values marked "unverified" have no source, values
-// marked "one public reproduction" a single one.
+// for `method`; "" stands for all. `values`: NAME=VALUE, separated by blanks. ODT's paper prints no such table: values
+// marked "unverified" have no source, values marked "one public reproduction" a single one.
 struct TaskRow {
-    const char *task, *method, *name, *value, *source;
+    const char *task, *method, *values, *source;
 };
 // WODTEM Table II: each row likewise.
 inline const TaskRow task_rows[] = {
-    {"", "", "layers", "4", "ODT's code"},
-    {"", "", "heads", "4", "ODT's code"},
-    {"", "", "width", "512", "ODT's code"},
-    {"", "", "context_length", "20", "ODT's code"},
-    {"", "", "updates_per_iteration", "300", "ODT's code"},
-    {"", "", "buffer_size", "1000", "ODT's code"},
-    {"", "", "eval_episodes", "10", "ODT's code"},
-    {"", "", "reward_scale", "0.001", "ODT's code"},
-    {"", "", "learning_rate", "1e-4", "ODT's code"},
-    {"", "", "weight_decay", "5e-4", "ODT's code"},
-    {"", "", "offline_updates", "5000", "ODT's code"},
-    {"", "", "position", "no", "ODT's code"},
-    {"", "", "gamma", "0.99", "WODTEM sec. V-C"},
-    {"", "", "epsilon", "0.1", "WODTEM sec. V-C"},
-    {"", "", "online_steps", "200000", "WODTEM sec. V-C"},
-    {"", "", "projected_dim", "4", "WODTEM sec. V-C"},
-    {"", "", "table_size", "2e6", "WODTEM sec. V-C"},
-    {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
-    {"", "", "K", "2", "WODTEM sec. V-C"},
-    {"", "", "physics", "d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
-    {"", "", "behaviour", "recorded", "the data set"},
-    {"", "", "data_trajectories", "10", "chosen, of random actions: enough to normalise states by"},
-    {"", "", "data_seed", "0", "chosen"},
-    {"hopper", "", "g_eval", "3600", "ODT's code"},
-    {"hopper", "", "g_online", "7200", "ODT's code"},
-    {"hopper", "", "eta", "-3", "ODT's code: minus the action dimensions"},
-    {"hopper-medium-replay", "", "learning_rate", "2e-3", "one public reproduction of ODT"},
-    {"hopper-medium-replay", "", "weight_decay", "1e-4", "one public reproduction of ODT"},
-    {"walker2d", "", "learning_rate", "1e-3", "public reproductions of ODT agree"},
-    {"walker2d", "", "weight_decay", "1e-3", "public reproductions of ODT agree"},
-    {"walker2d", "", "offline_updates", "10000", "public reproductions of ODT agree"},
-    {"walker2d", "", "g_eval", "5000", "public reproductions of ODT agree"},
-    {"walker2d", "", "g_online", "10000", "public reproductions of ODT agree"},
-    {"walker2d", "", "eta", "-6", "ODT's code: minus the action dimensions"},
-    {"walker2d", "", "epsilon", "0.2", "WODTEM sec. V-C"},
-    {"halfcheetah", "", "g_eval", "6000", "public reproductions of ODT agree"},
-    {"halfcheetah", "", "g_online", "12000", "public reproductions of ODT agree"},
-    {"halfcheetah", "", "eta", "-6", "ODT's code: minus the action dimensions"},
-    {"halfcheetah", "", "epsilon", "0.6", "WODTEM sec. V-C"},
-    {"ant-", "", "g_eval", "6000", "unverified"},
-    {"ant-", "", "g_online", "12000", "unverified"},
-    {"ant", "", "eta", "-8", "ODT's code: minus the action dimensions"},
-    {"ant", "", "epsilon", "0.3", "WODTEM sec. V-C"},
-    {"antmaze", "", "width", "1024", "one public reproduction of ODT"},
-    {"antmaze", "", "learning_rate", "1e-3", "one public reproduction of ODT"},
-    {"antmaze", "", "weight_decay", "0", "one public reproduction of ODT"},
-    {"antmaze", "", "offline_updates", "7000", "one public reproduction of ODT"},
-    {"antmaze", "", "buffer_size", "1500", "one public reproduction of ODT"},
-    {"antmaze", "", "position", "yes", "one public reproduction of ODT"},
-    {"antmaze", "", "g_eval", "1", "one public reproduction of ODT"},
-    {"antmaze", "", "g_online", "2", "one public reproduction of ODT"},
-    {"antmaze", "", "reward_scale", "1", "ODT's code"},
-    {"maze2d", "", "layers", "4", "WODTEM Table II: number of layers"},
-    {"maze2d", "", "heads", "4", "WODTEM Table II: number of attention heads"},
-    {"maze2d", "", "width", "512", "WODTEM Table II: embedding dimension"},
-    {"maze2d", "", "context_length", "20", "WODTEM Table II: context length"},
-    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II: learning rate"},
-    {"maze2d", "", "weight_decay", "0", "WODTEM Table II: weight decay"},
-    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II: offline training updates"},
-    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II: online training updates per iteration"},
-    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II: buffer size"},
-    {"maze2d", "", "position", "yes", "WODTEM Table II: position"},
-    {"maze2d", "", "eta", "-2", "ODT's code: minus the action dimensions"},
-    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II: g_online"},
-    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II: g_eval"},
-    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II: g_online"},
-    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II: g_eval"},
-    {"maze2d-large", "", "g_online", "560", "WODTEM Table II: g_online"},
-    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II: g_eval"},
-    {"maze2d-large", "", "table_size", "4e6", "WODTEM sec. V-C"},
-    {"", "dt", "layers", "3", "DT's code"},
-    {"", "dt", "heads", "1", "DT's code"},
-    {"", "dt", "width", "128", "DT's code"},
-    {"", "dt", "eval_context", "20", "DT's code"},
-    {"", "dt", "batch_size", "64", "DT's code"},
-    {"", "dt", "optimizer", "adamw", "DT's code"},
-    {"", "dt", "learning_rate", "1e-4", "DT's code"},
-    {"", "dt", "weight_decay", "1e-4", "DT's code"},
-    {"", "dt", "offline_updates", "100000", "DT's code"},
-    {"", "dt", "position", "yes", "DT's code"},
-    {"maze2d", "dt", "reward_scale", "1", "chosen: as others' DT on maze2d"},
+    {"", "",
+     "layers=4 heads=4 width=512 context_length=20 position=no learning_rate=1e-4 weight_decay=5e-4 "
+     "offline_updates=5000 updates_per_iteration=300 buffer_size=1000 eval_episodes=10 reward_scale=0.001",
+     "ODT's code"},
+    {"", "", "online_steps=200000 gamma=0.99 epsilon=0.1 projected_dim=4 table_size=2e6 alpha=0.9 K=2",
+     "WODTEM sec. V-C"},
+    {"", "", "physics=d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
+    {"", "", "behaviour=recorded", "the data set"},
+    {"", "", "data_trajectories=10", "chosen, of random actions: enough to normalise states by"},
+    {"", "", "data_seed=0", "chosen"},
+    {"hopper", "", "g_eval=3600 g_online=7200", "ODT's code"},
+    {"hopper", "", "eta=-3", "ODT's code: minus the action dimensions"},
+    {"hopper-medium-replay", "", "learning_rate=2e-3 weight_decay=1e-4", "one public reproduction of ODT"},
+    {"walker2d", "", "learning_rate=1e-3 weight_decay=1e-3 offline_updates=10000 g_eval=5000 g_online=10000",
+     "public reproductions of ODT agree"},
+    {"walker2d", "", "eta=-6", "ODT's code: minus the action dimensions"},
+    {"walker2d", "", "epsilon=0.2", "WODTEM sec. V-C"},
+    {"halfcheetah", "", "g_eval=6000 g_online=12000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "eta=-6", "ODT's code: minus the action dimensions"},
+    {"halfcheetah", "", "epsilon=0.6", "WODTEM sec. V-C"},
+    {"ant-", "", "g_eval=6000 g_online=12000", "unverified"},
+    {"ant", "", "eta=-8", "ODT's code: minus the action dimensions"},
+    {"ant", "", "epsilon=0.3", "WODTEM sec. V-C"},
+    {"antmaze", "",
+     "width=1024 position=yes learning_rate=1e-3 weight_decay=0 offline_updates=7000 buffer_size=1500 g_eval=1 "
+     "g_online=2",
+     "one public reproduction of ODT"},
+    {"antmaze", "", "reward_scale=1", "ODT's code"},
+    {"maze2d", "", "layers=4", "WODTEM Table II: number of layers"},
+    {"maze2d", "", "heads=4", "WODTEM Table II: number of attention heads"},
+    {"maze2d", "", "width=512", "WODTEM Table II: embedding dimension"},
+    {"maze2d", "", "context_length=20", "WODTEM Table II: context length"},
+    {"maze2d", "", "learning_rate=1e-3", "WODTEM Table II: learning rate"},
+    {"maze2d", "", "weight_decay=0", "WODTEM Table II: weight decay"},
+    {"maze2d", "", "offline_updates=20000", "WODTEM Table II: offline training updates"},
+    {"maze2d", "", "updates_per_iteration=300", "WODTEM Table II: online training updates per iteration"},
+    {"maze2d", "", "buffer_size=1500", "WODTEM Table II: buffer size"},
+    {"maze2d", "", "position=yes", "WODTEM Table II: position"},
+    {"maze2d", "", "eta=-2", "ODT's code: minus the action dimensions"},
+    {"maze2d", "", "g_online=560", "WODTEM Table II: g_online"},
+    {"maze2d", "", "g_eval=280", "WODTEM Table II: g_eval"},
+    {"maze2d-umaze", "", "g_online=340", "WODTEM Table II: g_online"},
+    {"maze2d-umaze", "", "g_eval=170", "WODTEM Table II: g_eval"},
+    {"maze2d-large", "", "table_size=4e6", "WODTEM sec. V-C"},
+    {"", "dt",
+     "layers=3 heads=1 width=128 eval_context=20 position=yes optimizer=adamw learning_rate=1e-4 weight_decay=1e-4 "
+     "batch_size=64 offline_updates=100000",
+     "DT's code"},
+    {"maze2d", "dt", "reward_scale=1", "chosen: as others' DT on maze2d"},
 };
 
 // Preset small: what it changes of preset paper, so that a run takes half an hour on two cores. All three methods share
 // one network and one schedule, so that only the objective differs.
 inline const TaskRow small_rows[] = {
-    {"", "", "layers", "2", "preset small"},
-    {"", "", "heads", "2", "preset small"},
-    {"", "", "width", "64", "preset small"},
-    {"", "", "context_length", "1", "preset small: states tell all; more windows instead of longer ones"},
-    {"", "", "batch_size", "256", "preset small: ODT's"},
-    {"", "", "position", "no",
-     "preset small: maze2d's data end after 230 steps; later rows of the table would not learn"},
-    {"", "", "learning_rate", "1e-3", "preset small: a narrow network and few updates"},
-    {"", "", "warmup_updates", "1000", "preset small: a tenth of ODT's"},
-    {"", "", "offline_updates", "6000", "preset small"},
-    {"", "dt", "offline_updates", "12700", "preset small: as many as the others make, where episodes have 300 steps"},
-    {"", "", "updates_per_iteration", "100", "preset small"},
-    {"", "", "online_steps", "20000", "preset small: a tenth of WODTEM's"},
-    {"maze2d", "", "reward_scale", "1", "preset small: at ODT's 0.001 returns-to-go, at most 0.055, are not heeded"},
-    {"maze2d", "", "buffer_size", "4000", "preset small: the best 1500 trajectories all leave the goal"},
+    {"", "", "layers=2 heads=2 width=64 offline_updates=6000 updates_per_iteration=100", "preset small"},
+    {"", "", "context_length=1", "preset small: states tell all; more windows instead of longer ones"},
+    {"", "", "batch_size=256", "preset small: ODT's"},
+    {"", "", "position=no", "preset small: maze2d's data end after 230 steps; later rows of the table would not learn"},
+    {"", "", "learning_rate=1e-3", "preset small: a narrow network and few updates"},
+    {"", "", "warmup_updates=1000", "preset small: a tenth of ODT's"},
+    {"", "dt", "offline_updates=12700", "preset small: as many as the others make, where episodes have 300 steps"},
+    {"", "", "online_steps=20000", "preset small: a tenth of WODTEM's"},
+    {"maze2d", "", "reward_scale=1", "preset small: at ODT's 0.001 returns-to-go, at most 0.055, are not heeded"},
+    {"maze2d", "", "buffer_size=4000", "preset small: the best 1500 trajectories all leave the goal"},
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -328,25 +313,11 @@ inline const TaskRow small_rows[] = {
 
 // Errors: usage.setting names the nearest setting.
 inline const SettingRow& setting_row(const std::string& name) {
-    std::vector<std::string> names;
-    for (const SettingRow& row : setting_rows) {
-        if (name == row.name) return row;
-        names.push_back(row.name);
-    }
-    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(),
-         nearest_name(name, names).c_str());
+    return row_named(setting_rows, name, "usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"");
 }
 
 inline std::string setting_text(const Settings& settings, const SettingRow& row) {
-    const auto text = [&](auto field) -> std::string {
-        const auto& value = settings.*field;
-        using Value = std::decay_t<decltype(value)>;
-        if constexpr (std::is_same_v<Value, bool>) return value ? "yes" : "no";
-        if constexpr (std::is_same_v<Value, int64_t>) return std::to_string(value);
-        if constexpr (std::is_same_v<Value, double>) return number_text(value);
-        if constexpr (std::is_same_v<Value, std::string>) return value;
-    };
-    return std::visit(text, row.field);
+    return std::visit([&](auto field) { return value_text(settings.*field); }, row.field);
 }
 
 inline std::string parse_choice(const SettingRow& row, const std::string& text) {
@@ -407,7 +378,9 @@ inline Settings default_settings(const std::string& task, const std::string& met
     const auto apply = [&](std::span<const TaskRow> rows) {
         for (const TaskRow& row : rows)
             if (!gridworld && settings.task.starts_with(row.task) && (*row.method == 0 || method == row.method))
-                set_from(settings, row.name, row.value, row.source);
+                for (const std::string& assignment : split(row.values, ' '))
+                    set_from(settings, assignment.substr(0, assignment.find('=')),
+                             assignment.substr(assignment.find('=') + 1), row.source);
     };
     apply(task_rows);
     if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
@@ -465,15 +438,15 @@ struct Setting {
 // The lines of a text form, before they are checked against the table. Blank lines and lines that begin with # are
 // skipped; the first " = " of a line ends the name, the first " # " after it ends the value. Errors: settings.line,
 // settings.repeated.
-inline std::vector<Setting> parse_settings(std::string_view text, const std::string& path) {
+inline std::vector<Setting> parse_settings(const std::string& text, const std::string& path) {
     std::vector<Setting> out;
-    for (size_t line = 1; !text.empty(); ++line) {
-        const std::string_view all = text.substr(0, text.find('\n'));
-        text.remove_prefix(std::min(text.size(), all.size() + 1));
+    size_t line = 0;
+    for (const std::string& all : split(text, '\n')) {
+        ++line;
         if (trimmed(all).empty() || trimmed(all)[0] == '#') continue;
         const size_t equals = all.find(" = "), hash = all.find(" # ", equals);  // npos stays npos
         Setting setting;
-        if (hash != std::string_view::npos)
+        if (hash != std::string::npos)
             setting = {trimmed(all.substr(0, equals)), trimmed(all.substr(equals + 2, hash - equals - 2)),
                        trimmed(all.substr(hash + 2))};
         if (setting.name.empty() || setting.value.empty() || setting.source.empty())
@@ -490,17 +463,15 @@ inline std::vector<Setting> parse_settings(std::string_view text, const std::str
 // `path` is named in errors: settings.value, settings.missing, and those of parse_settings().
 inline Settings settings_from_text(const std::string& text, const std::string& path) {
     Settings settings;
-    std::set<std::string> found;
     for (const auto& [name, value, source] : parse_settings(text, path)) {
         try {
             set_from(settings, name, value, source);
         } catch (const Error& error) {
             fail("settings.value", "%s: %s; is it damaged, or from another version?", path.c_str(), error.what());
         }
-        found.insert(name);
     }
     for (const SettingRow& row : setting_rows)
-        if (!found.contains(row.name))
+        if (!settings.source.contains(row.name))
             fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
                  row.name);
     return settings;
