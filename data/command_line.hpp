@@ -193,15 +193,14 @@ inline int run_program(std::span<const Command> commands, const std::vector<std:
     std::signal(SIGXFSZ, SIG_IGN);  // the same for a limit on file sizes
     try {
         return run_command_line(commands, words);
-    } catch (const Error& error) {
-        std::fprintf(stderr, "wodtem: %s\n", error.what());
-        return error.id.starts_with("usage.") ? 2 : 1;
     } catch (const std::bad_alloc&) {
         std::fprintf(stderr, "wodtem: out of memory\n");
+        return 1;
     } catch (const std::exception& error) {
         std::fprintf(stderr, "wodtem: %s\n", error.what());
+        const auto* known = dynamic_cast<const Error*>(&error);
+        return known && known->id.starts_with("usage.") ? 2 : 1;
     }
-    return 1;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -10,15 +10,13 @@
 // Promises: equal data give equal text in every locale; no scripts, fonts or other files are needed; all text is
 // escaped; numbers that are NaN, or 1e15 and beyond, break a line or leave a bar out and are never written.
 // Leaves out: knowledge of what is drawn (labels come from the caller, in UTF-8), interaction, exact text widths.
-// Order: SVG elements; the whole figure; axes; charts; maps of cells; tables and pages.
+// Order: SVG elements; the whole figure; charts; maps of cells; tables and pages.
 #pragma once
 
 #include <algorithm>
 #include <charconv>
 #include <cmath>
-#include <limits>
 #include <string>
-#include <string_view>
 #include <utility>
 #include <variant>
 #include <vector>
@@ -151,7 +149,7 @@ inline std::string picture(double w, double y, const std::string& title, std::st
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Axes
+// Charts: axes, then what lies on them
 
 struct Tick {
     double value;
@@ -185,9 +183,6 @@ inline Axis linear_axis(double low, double high, int count, double from, double 
     return {ticks.front().value, ticks.back().value, from, to, ticks};
 }
 
-// ---------------------------------------------------------------------------------------------------------------------
-// Charts
-
 inline constexpr double plot_top = 50, plot_bottom = 350, plot_right = width - 40;
 
 // One mean and one deviation (half the height of a band or of an error bar) for each x or category; NaN: none.
@@ -220,8 +215,7 @@ inline double deviation_at(const Series& s, size_t i) { return drawable(s.deviat
 // The axis covers the points with their bands or error bars, and the marks; of bars the zero too. Bands of numbers that
 // are not negative are cut at zero.
 inline Axis y_axis(const Chart& chart) {
-    const double infinity = std::numeric_limits<double>::infinity();
-    double low = chart.bars() ? 0 : infinity, high = chart.bars() ? 0 : -infinity, least = infinity;
+    double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY, least = INFINITY;
     const auto include = [&](double mean, double deviation) {
         if (!drawable(mean)) return;
         low = std::min(low, mean - deviation);
@@ -512,8 +506,7 @@ struct Html {
 };
 
 // The title, all verdicts, then the sections.
-template <class Writer>
-std::string page(const Writer& writer, const std::string& title, const std::vector<Section>& sections) {
+inline std::string page(const auto& writer, const std::string& title, const std::vector<Section>& sections) {
     std::string out = writer.heading(1, title);
     for (const Section& section : sections)
         if (!section.verdict.empty()) out += writer(section.verdict);

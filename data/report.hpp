@@ -2,13 +2,8 @@
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
 // length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
 //
-// Reads from each folder:  settings            the text form of Settings
-//                          progress.csv        one row per evaluation, the first at the end of the offline phase
-//                          episodes.csv        one row per online episode
-//                          finished            an empty file; without it the logs above may be missing or incomplete
-//   mazes, if it is there: paths.csv           one row per state of the latest evaluation's episodes
-//   finished grid worlds:  policy.csv          probability of each move in each cell
-//                          start_actions.csv   share of each move at S: learned, D_offline, D_online
+// Reads what run_folder.hpp writes: settings, progress.csv, episodes.csv (without the file `finished` these logs may be
+// missing or incomplete); of mazes paths.csv, if it is there; of finished grid worlds policy.csv and start_actions.csv.
 // Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; seeds are
 // averaged only if nothing but the seed was set differently, and the physics were the same; errors name file and line.
 // Leaves out: networks, statistics beyond mean and standard deviation, judging whether a difference matters.
@@ -16,7 +11,6 @@
 #pragma once
 
 #include <array>
-#include <cstdint>
 #include <filesystem>
 #include <map>
 #include <tuple>
@@ -49,7 +43,7 @@ inline Table parse_csv(const std::string& text, const std::string& path) {
 
 namespace results {  // the training program has names of its own: Run, Spread, ...
 
-constexpr double none = std::numeric_limits<double>::quiet_NaN();
+constexpr double none = NAN;
 
 // A CSV file with its path, which its errors name.
 struct Log {
@@ -122,7 +116,7 @@ using MoveShares = std::array<double, grid_moves>;
 struct MazeEpisode {
     double goal_x, goal_y;           // m, as observed
     bool reached;                    // some state lies within goal_radius of the goal
-    std::vector<svg::Place> places;  // of each state, on the map
+    std::vector<svg::Place> places;  // of each state, on the map or outside of it
 };
 
 struct Run {
@@ -171,12 +165,6 @@ inline std::array<std::vector<double>, 3> read_start_actions(const Log& log) {
     return {log.numbers("learned", 0, 1), log.numbers("offline", 0, 1), log.numbers("online", 0, 1, true)};
 }
 
-// An observed position (m) on the map, in cells; it may lie outside of the map.
-inline svg::Place place_on_map(const MujocoTask& task, double x, double y) {
-    const auto [row, column] = maze_place(task, x, y);
-    return {row, column};
-}
-
 // paths.csv: episodes count from 0, and in each of them its steps; an episode keeps its goal.
 // Errors: csv.order, csv.number.
 inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& log) {
@@ -194,7 +182,8 @@ inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& lo
                  "episode keeps its goal",
                  log.path.c_str(), i + 2, episode[i], step[i]);
         MazeEpisode& latest = out.back();
-        latest.places.push_back(place_on_map(task, x[i], y[i]));
+        const auto [row, column] = maze_place(task, x[i], y[i]);
+        latest.places.push_back({row, column});
         latest.reached = latest.reached || std::hypot(x[i] - goal_x[i], y[i] - goal_y[i]) <= goal_radius;
     }
     return out;
@@ -273,8 +262,7 @@ inline std::string plus_minus(const Spread& spread) {
 }
 
 // Mean and deviation over runs of each entry of row_of(run), a list that is equally long for all runs.
-template <class RowOf>
-svg::Series mean_series(const char* label, const char* colour, const Runs& runs, RowOf row_of) {
+inline svg::Series mean_series(const char* label, const char* colour, const Runs& runs, const auto& row_of) {
     std::vector<std::vector<double>> rows;
     for (const Run* run : runs) rows.push_back(row_of(*run));
     svg::Series out{label, colour, {}, {}};
@@ -312,10 +300,9 @@ inline Spread spread_of(const Runs& runs, Summary summary, Quantity quantity) {
 
 // Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run;
 // long runs in larger steps, at most about 400. There are at least two points.
-inline std::vector<double> curve_points(const std::vector<Runs>& by_method) {
+inline std::vector<double> curve_points(const Runs& runs) {
     double largest = 250;
-    for (const Runs& runs : by_method)
-        for (const Run* run : runs) largest = std::max(largest, run->so_far);
+    for (const Run* run : runs) largest = std::max(largest, run->so_far);
     const double step = 250 * std::ceil(largest / 250 / 400);
     std::vector<double> out;
     for (double at = 0; at <= largest; at += step) out.push_back(at);
@@ -439,7 +426,7 @@ inline Figure curve(const Group& group, Quantity quantity, const std::string& ca
     const bool length = quantity == &Run::length;
     const char* label = length ? "evaluation length, steps" : "normalised score";
     svg::Chart chart{group.any().settings.task + ": " + label, "online interactions", label};
-    chart.x = curve_points(group.by_method);
+    chart.x = curve_points(group.runs);
     for (const Runs& runs : group.by_method) {
         const Method& method = runs[0]->about_method();
         chart.series.push_back(mean_series(method.label, method.colour, runs,
@@ -539,9 +526,8 @@ inline Figure maze_map(const Group& group, const Run& run) {
         const MazeEpisode& episode = run.paths[i];
         reached += episode.reached;
         if (i >= path_colours.size()) continue;
-        if (ant || i == 0)
-            map.add_circle(place_on_map(task, episode.goal_x, episode.goal_y), radius,
-                           ant ? path_colours[i] : svg::ink);
+        const auto [row, column] = maze_place(task, episode.goal_x, episode.goal_y);
+        if (ant || i == 0) map.add_circle({row, column}, radius, ant ? path_colours[i] : svg::ink);
         map.add_path(episode.places, path_colours[i]);
     }
     const std::string caption =
@@ -559,9 +545,8 @@ inline Figure maze_map(const Group& group, const Run& run) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tables and sentences
 
-// How many of the runs have not finished.
-inline size_t unfinished(const Runs& runs) {
-    return static_cast<size_t>(std::count_if(runs.begin(), runs.end(), [](const Run* run) { return !run->finished; }));
+inline long unfinished(const Runs& runs) {
+    return std::count_if(runs.begin(), runs.end(), [](const Run* run) { return !run->finished; });
 }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
@@ -611,13 +596,12 @@ inline Table method_table(const Group& group) {
         const auto mean = [&](Summary summary, Quantity quantity) {
             return plus_minus(spread_of(runs, summary, quantity));
         };
-        const size_t open = unfinished(runs);
+        std::string seeds = std::to_string(runs.size());
+        if (unfinished(runs) > 0) seeds += " (" + std::to_string(unfinished(runs)) + " unfinished)";
         const PaperResult* paper = paper_result(*runs[0]);
-        const std::string seeds = std::to_string(runs.size()),
-                          unfinished_seeds = " (" + std::to_string(open) + " unfinished)";
-        table.rows.push_back({runs[0]->about_method().label, seeds + (open > 0 ? unfinished_seeds : ""),
-                              mean(final_value, group.quantity), mean(last_ten, group.quantity),
-                              paper ? paper->text() : "-", mean(final_value, &Run::total)});
+        table.rows.push_back({runs[0]->about_method().label, seeds, mean(final_value, group.quantity),
+                              mean(last_ten, group.quantity), paper ? paper->text() : "-",
+                              mean(final_value, &Run::total)});
         if (scores) table.rows.back().push_back(mean(final_value, &Run::length));
     }
     return table;
@@ -746,24 +730,24 @@ inline Section make_section(const Runs& runs) {
     return section;
 }
 
-inline const char* how_to_read[] = {
-    "One section for each task, preset and physics. All numbers come from the run folders, except those marked as the "
-    "paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last "
-    "evaluation of a run; last 10: mean over its last ten evaluations; an evaluation that came to nothing (nan in "
-    "progress.csv) is passed over. \"Agrees\": our mean lies within the paper's standard deviation of the paper's mean "
-    "(grid world: WODTEM 5, ODT 6.5 to 7.5).",
-    "Curves: mean over seeds, and a band of one standard deviation to either side; diamonds: the paper's final "
-    "results. Seeds are evaluated at different interactions; each is drawn by its last evaluation until then, and at "
-    "the right end by its final one. DT has no online phase and is a dashed line across. Bars: mean over seeds; "
-    "strokes: one standard deviation to either side. Unfinished runs count as far as they go, so that a curve may jump "
-    "where one of them ends. The file settings in a run's folder has the value of every setting and where it came "
-    "from."};
-
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
     std::map<std::tuple<std::string, std::string, std::string>, Runs> groups;
     for (const Run& run : runs) groups[{run.settings.task, run.settings.preset, run.settings.physics}].push_back(&run);
-    std::vector<Section> sections{{"How to read this", {how_to_read[0], how_to_read[1]}}};
+    const char* const numbers =
+        "One section for each task, preset and physics. All numbers come from the run folders, except those marked as "
+        "the paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last "
+        "evaluation of a run; last 10: mean over its last ten evaluations; an evaluation that came to nothing (nan in "
+        "progress.csv) is passed over. \"Agrees\": our mean lies within the paper's standard deviation of the paper's "
+        "mean (grid world: WODTEM 5, ODT 6.5 to 7.5).";
+    const char* const figures =
+        "Curves: mean over seeds, and a band of one standard deviation to either side; diamonds: the paper's final "
+        "results. Seeds are evaluated at different interactions; each is drawn by its last evaluation until then, and "
+        "at the right end by its final one. DT has no online phase and is a dashed line across. Bars: mean over "
+        "seeds; strokes: one standard deviation to either side. Unfinished runs count as far as they go, so that a "
+        "curve may jump where one of them ends. The file settings in a run's folder has the value of every setting "
+        "and where it came from.";
+    std::vector<Section> sections{{"How to read this", {numbers, figures}}};
     for (const auto& group : groups) sections.push_back(make_section(group.second));
     return sections;
 }
@@ -796,8 +780,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
         }
         if (!section.verdict.empty()) text += markdown(section.verdict);
     }
-    const std::string title =
-        "WODTEM: report on " + std::to_string(runs.size()) + (runs.size() == 1 ? " run" : " runs");
+    const std::string title = "WODTEM: report on " + std::to_string(runs.size()) + (runs.size() > 1 ? " runs" : " run");
     write_file_atomic(out_folder + "/report.html", html_page(title, sections));
     write_file_atomic(out_folder + "/report.md", page(markdown, title, sections));
     return text;

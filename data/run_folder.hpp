@@ -47,8 +47,7 @@ struct Tally {
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
     double dropped = 0;  // episodes whose simulation broke down
 
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("progress.loss", loss);
         archive("progress.entropy", entropy);
         archive("progress.gradient_norm", gradient_norm);
@@ -81,8 +80,7 @@ struct EpisodeRow {
 };
 
 // A line of a log: the fields as value_text() gives them.
-template <class... Fields>
-std::string csv_line(const Fields&... fields) {
+inline std::string csv_line(const auto&... fields) {
     std::string line;
     ((line += value_text(fields) + ","), ...);
     line.back() = '\n';
@@ -201,8 +199,7 @@ struct RunFolder {
         progress.sync();
         episodes.sync();
     }
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("progress.progress_bytes", progress.bytes);
         archive("progress.episodes_bytes", episodes.bytes);
         archive("progress.progress_crc", progress.crc);
@@ -252,8 +249,7 @@ inline void claim_folder(const RunFolder& folder, const Settings& settings) {
 inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";
 
 // The logs reach the disk first: the checkpoint notes how long they are.
-template <class Visit>
-void save_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void save_checkpoint(RunFolder& folder, const Settings& settings, auto&& visit) {
     folder.sync_logs();
     TensorFile file;
     file.metadata["format"] = checkpoint_format;
@@ -265,8 +261,7 @@ void save_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit)
 }
 
 // Reads the state alone. Errors name the file: checkpoint.format, run.other_settings, and those of the visited state.
-template <class Visit>
-void load_state(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit) {
     const std::string path = folder.file("checkpoint.safetensors");
     try {
         const TensorFile file = read_safetensors(path);
@@ -282,8 +277,7 @@ void load_state(RunFolder& folder, const Settings& settings, Visit&& visit) {
 }
 
 // Reads the state and cuts the logs back to where they were; if one of them does not fit, neither is touched.
-template <class Visit>
-void load_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void load_checkpoint(RunFolder& folder, const Settings& settings, auto&& visit) {
     load_state(folder, settings, visit);
     folder.progress.check();
     folder.episodes.check();
@@ -298,8 +292,7 @@ struct CheckpointTimer {
     double save_seconds = 0;  // of the latest one
 
     bool due() const { return every == 0 || seconds_since(saved) >= std::max(every, 20 * save_seconds); }
-    template <class Save>
-    void time(Save&& save) {
+    void time(auto&& save) {
         const Clock::time_point begin = Clock::now();
         save();
         save_seconds = seconds_since(begin);

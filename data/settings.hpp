@@ -17,10 +17,10 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <ranges>
 #include <span>
 #include <string>
 #include <string_view>
-#include <utility>
 #include <variant>
 #include <vector>
 
@@ -33,13 +33,8 @@
 
 // The parts of a text between separators; "" is one empty part.
 inline std::vector<std::string> split(const std::string& text, char separator) {
-    std::vector<std::string> parts(1);
-    for (const char c : text) {
-        if (c == separator)
-            parts.emplace_back();
-        else
-            parts.back() += c;
-    }
+    std::vector<std::string> parts(text.empty() ? 1 : 0);
+    for (const auto part : std::views::split(text, separator)) parts.emplace_back(part.begin(), part.end());
     return parts;
 }
 
@@ -49,9 +44,8 @@ inline std::string trimmed(std::string_view text) {
     return std::string(text.substr(first, text.find_last_not_of(" \t") + 1 - first));
 }
 
-// The shortest text that reads back as the same number; Number is any type of numbers.
-template <class Number>
-std::string number_text(Number x) {
+// The shortest text that reads back as the same number, of whatever type it is.
+inline std::string number_text(auto x) {
     char text[32];
     return {text, std::to_chars(text, text + sizeof text, x).ptr};
 }
@@ -99,8 +93,7 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
 
 // The row of a table that has this name. `sentence` is a format of two texts: the name, and the nearest one.
 // Errors: `id`, if there is none.
-template <class Rows>
-const auto& row_named(const Rows& rows, const std::string& name, const char* id, const std::string& sentence) {
+inline const auto& row_named(const auto& rows, const std::string& name, const char* id, const std::string& sentence) {
     std::vector<std::string> names;
     for (const auto& row : rows) {
         if (name == row.name) return row;
@@ -253,17 +246,13 @@ inline const TaskRow task_rows[] = {
     {"", "", "data_trajectories=10", "chosen, of random actions: enough to normalise states by"},
     {"", "", "data_seed=0", "chosen"},
     {"hopper", "", "g_eval=3600 g_online=7200", "ODT's code"},
-    {"hopper", "", "eta=-3", "ODT's code: minus the action dimensions"},
     {"hopper-medium-replay", "", "learning_rate=2e-3 weight_decay=1e-4", "one public reproduction of ODT"},
     {"walker2d", "", "learning_rate=1e-3 weight_decay=1e-3 offline_updates=10000 g_eval=5000 g_online=10000",
      "public reproductions of ODT agree"},
-    {"walker2d", "", "eta=-6", "ODT's code: minus the action dimensions"},
     {"walker2d", "", "epsilon=0.2", "WODTEM sec. V-C"},
     {"halfcheetah", "", "g_eval=6000 g_online=12000", "public reproductions of ODT agree"},
-    {"halfcheetah", "", "eta=-6", "ODT's code: minus the action dimensions"},
     {"halfcheetah", "", "epsilon=0.6", "WODTEM sec. V-C"},
     {"ant-", "", "g_eval=6000 g_online=12000", "unverified"},
-    {"ant", "", "eta=-8", "ODT's code: minus the action dimensions"},
     {"ant", "", "epsilon=0.3", "WODTEM sec. V-C"},
     {"antmaze", "",
      "width=1024 position=yes learning_rate=1e-3 weight_decay=0 offline_updates=7000 buffer_size=1500 g_eval=1 "
@@ -280,7 +269,6 @@ inline const TaskRow task_rows[] = {
     {"maze2d", "", "updates_per_iteration=300", "WODTEM Table II: online training updates per iteration"},
     {"maze2d", "", "buffer_size=1500", "WODTEM Table II: buffer size"},
     {"maze2d", "", "position=yes", "WODTEM Table II: position"},
-    {"maze2d", "", "eta=-2", "ODT's code: minus the action dimensions"},
     {"maze2d", "", "g_online=560", "WODTEM Table II: g_online"},
     {"maze2d", "", "g_eval=280", "WODTEM Table II: g_eval"},
     {"maze2d-umaze", "", "g_online=340", "WODTEM Table II: g_online"},
@@ -383,6 +371,8 @@ inline Settings default_settings(const std::string& task, const std::string& met
                              assignment.substr(assignment.find('=') + 1), row.source);
     };
     apply(task_rows);
+    if (const MujocoTask* mujoco = find_mujoco_task(settings.task))
+        set_from(settings, "eta", std::to_string(-mujoco->action_dim), "ODT's code: minus the action dimensions");
     if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (preset == "small") apply(small_rows);
     if (method == "dt") {

@@ -361,7 +361,7 @@ size_t count(const std::string& text, const std::string& part) {
     return found;
 }
 
-constexpr double not_measured = std::numeric_limits<double>::quiet_NaN();
+constexpr double not_measured = NAN;
 
 }  // namespace
 

@@ -170,10 +170,10 @@ TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
 
 TEST(resampling_takes_the_last_evaluation_at_or_before_each_point) {
     const Run run = run_with({0, 240, 250, 600, 760, 1010}, {50, 40, 30, 20, none, 10}, true);
-    CHECK(equal(curve_points({Runs{&run}}), {0, 250, 500, 750, 1000}));
+    CHECK(equal(curve_points({&run}), {0, 250, 500, 750, 1000}));
     const Run offline = run_with({0}, {50}, true), long_one = run_with({200000}, {50}, true);
-    CHECK(equal(curve_points({Runs{&offline}}), {0, 250}));
-    CHECK_EQUAL(curve_points({Runs{&long_one}})[1], 500.0);
+    CHECK(equal(curve_points({&offline}), {0, 250}));
+    CHECK_EQUAL(curve_points({&long_one})[1], 500.0);
     // 760 has no value; 1010 is the final one and shows at the last point
     CHECK(equal(resampled(run, &Run::length, {0, 249, 250, 500, 750, 900, 1000}), {50, 40, 30, 30, 20, 20, 10}));
 }
