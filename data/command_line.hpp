@@ -161,30 +161,25 @@ inline void print_help(const Command& command) {
     if (command.notes) std::printf("%s", command.notes().c_str());
 }
 
-inline void flush_results() {
-    if (std::fflush(stdout) != 0 || std::ferror(stdout))
-        fail("console.write", "cannot write the results to stdout: is the disk full?");
-}
-
-// Returns the exit status. Errors: usage.command, and those of the command.
+// Returns the exit status. Errors: usage.command, console.write, and those of the command.
 inline int run_command_line(std::span<const Command> commands, const std::vector<std::string>& words) {
     const auto asks_for_help = [](const std::string& word) {
         return word == "--help" || word == "-h" || word == "help";
     };
     if (words.empty() || asks_for_help(words[0])) {
         print_command_list(commands);
-        flush_results();
-        return words.empty() ? 2 : 0;
+    } else {
+        const Command& command = row_named(commands, words[0], "usage.command",
+                                           "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)");
+        const std::vector<std::string> rest(words.begin() + 1, words.end());
+        if (std::any_of(rest.begin(), rest.end(), asks_for_help))
+            print_help(command);
+        else
+            command.run(parse_arguments(command, rest));
     }
-    const Command& command = row_named(commands, words[0], "usage.command",
-                                       "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)");
-    const std::vector<std::string> rest(words.begin() + 1, words.end());
-    if (std::any_of(rest.begin(), rest.end(), asks_for_help))
-        print_help(command);
-    else
-        command.run(parse_arguments(command, rest));
-    flush_results();
-    return 0;
+    if (std::fflush(stdout) != 0 || std::ferror(stdout))
+        fail("console.write", "cannot write the results to stdout: is the disk full?");
+    return words.empty() ? 2 : 0;
 }
 
 // The body of main(): every error becomes a sentence on stderr and an exit status.

@@ -189,47 +189,41 @@ inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& lo
     return out;
 }
 
-// progress.csv and episodes.csv. A run that has just begun may not have them yet. Errors: those of Log.
-inline void read_logs(Run& run) {
-    const auto present = [&](const std::string& path) { return run.finished || std::filesystem::exists(path); };
-    const std::string progress = run.folder + "/progress.csv", episodes = run.folder + "/episodes.csv";
-    if (present(progress)) {
-        const Log log(progress);
+// All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
+inline Run read_run(const std::string& folder) {
+    const auto file = [&](const char* name) { return folder + "/" + name; };
+    const auto exists = [&](const char* name) { return std::filesystem::exists(file(name)); };
+    if (!exists("settings"))
+        fail("report.folder", "%s: is no run folder: it has no file `settings`, which training writes first",
+             folder.c_str());
+    Run run;
+    run.folder = folder;
+    run.settings = settings_from_text(read_file(file("settings")), file("settings"));
+    while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
+    run.mujoco = find_mujoco_task(run.settings.task);
+    if (run.mujoco && run.settings.physics == "none")
+        fail("report.setting", "%s: %s cannot have physics none", file("settings").c_str(), run.settings.task.c_str());
+    run.finished = exists("finished");
+    if (run.finished || exists("progress.csv")) {  // a run that has just begun may not have its logs yet
+        const Log log(file("progress.csv"));
         run.interactions = log.interactions();
         run.length = log.results("eval_length");
         run.total = log.results("eval_return");
         run.score = log.results("eval_score");
+        if (!run.interactions.empty()) run.so_far = run.interactions.back();
     }
-    if (present(episodes) && !run.offline_only()) {
-        const Log log(episodes);
+    if (!run.offline_only() && (run.finished || exists("episodes.csv"))) {
+        const Log log(file("episodes.csv"));
         run.episode_length = log.numbers("length", 1, run.mujoco ? 1e9 : grid_max_steps);
         run.episode_return = log.results("return");
         const std::vector<double> at = log.interactions();
-        if (!at.empty()) run.so_far = at.back();
+        if (!at.empty()) run.so_far = std::max(run.so_far, at.back());
     }
-    if (!run.interactions.empty()) run.so_far = std::max(run.so_far, run.interactions.back());
-}
-
-// All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
-inline Run read_run(const std::string& folder) {
-    Run run;
-    run.folder = folder;
-    const std::string settings = folder + "/settings", paths = folder + "/paths.csv";
-    if (!std::filesystem::exists(settings))
-        fail("report.folder", "%s: is no run folder: it has no file `settings`, which training writes first",
-             folder.c_str());
-    run.settings = settings_from_text(read_file(settings), settings);
-    while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
-    run.mujoco = find_mujoco_task(run.settings.task);
-    if (run.mujoco && run.settings.physics == "none")
-        fail("report.setting", "%s: %s cannot have physics none", settings.c_str(), run.settings.task.c_str());
-    run.finished = std::filesystem::exists(folder + "/finished");
-    read_logs(run);
-    if (run.mujoco && run.mujoco->maze && std::filesystem::exists(paths))
-        run.paths = read_paths(*run.mujoco, Log(paths));
+    if (run.mujoco && run.mujoco->maze && exists("paths.csv"))
+        run.paths = read_paths(*run.mujoco, Log(file("paths.csv")));
     if (run.mujoco || !run.finished) return run;
-    run.policy = read_policy(Log(folder + "/policy.csv"));
-    if (!run.offline_only()) run.start_actions = read_start_actions(Log(folder + "/start_actions.csv"));
+    run.policy = read_policy(Log(file("policy.csv")));
+    if (!run.offline_only()) run.start_actions = read_start_actions(Log(file("start_actions.csv")));
     return run;
 }
 

@@ -172,7 +172,6 @@ struct Log {
         bytes = crc = 0;
         append(header);
     }
-    void sync() const { AppendFile(path).sync(); }
 
     // Errors: run.log, if the file does not begin with what it held at the checkpoint.
     void check() const {
@@ -196,8 +195,8 @@ struct RunFolder {
         episodes.begin(episodes_header);
     }
     void sync_logs() const {
-        progress.sync();
-        episodes.sync();
+        AppendFile(progress.path).sync();
+        AppendFile(episodes.path).sync();
     }
     void visit(auto& archive) {
         archive("progress.progress_bytes", progress.bytes);

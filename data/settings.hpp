@@ -308,39 +308,37 @@ inline std::string setting_text(const Settings& settings, const SettingRow& row)
     return std::visit([&](auto field) { return value_text(settings.*field); }, row.field);
 }
 
-inline std::string parse_choice(const SettingRow& row, const std::string& text) {
+// A value's text is checked by its type: a word against the choices of its row, a number against its range. Errors of
+// the three functions: usage.setting with what is allowed.
+inline void parse_value(const SettingRow& row, const std::string& text, std::string& value) {
     const std::vector<std::string> choices = split(row.choices, '|');
     if (*row.choices != 0 && std::find(choices.begin(), choices.end(), text) == choices.end())
         fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
              row.choices, nearest_name(text, choices).c_str());
-    return text;
+    value = text;
 }
 
-inline bool parse_flag(const SettingRow& row, const std::string& text) {
+inline void parse_value(const SettingRow& row, const std::string& text, bool& value) {
     if (text != "yes" && text != "no")
         fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
-    return text == "yes";
+    value = text == "yes";
 }
 
-inline double parse_number(const SettingRow& row, const std::string& text, bool whole) {
+template <class Number>
+void parse_value(const SettingRow& row, const std::string& text, Number& value) {
+    constexpr bool whole = std::is_integral_v<Number>;
     const std::optional<double> x = to_number(text);
-    if (x && *x >= row.low && *x <= row.high && (!whole || *x == std::floor(*x))) return *x;
     const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
-    fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
-         text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
-         number_text(whole ? std::round(nearest) : nearest).c_str());
+    if (x != nearest || (whole && *x != std::floor(*x)))
+        fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
+             text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
+             number_text(whole ? std::round(nearest) : nearest).c_str());
+    value = static_cast<Number>(*x);
 }
 
-// Errors: usage.setting with what is allowed.
 inline void set_setting(Settings& settings, const std::string& name, const std::string& text) {
     const SettingRow& row = setting_row(name);
-    if (const auto* word = std::get_if<std::string Settings::*>(&row.field))
-        settings.*(*word) = parse_choice(row, text);
-    if (const auto* flag = std::get_if<bool Settings::*>(&row.field)) settings.*(*flag) = parse_flag(row, text);
-    if (const auto* real = std::get_if<double Settings::*>(&row.field))
-        settings.*(*real) = parse_number(row, text, false);
-    if (const auto* integer = std::get_if<int64_t Settings::*>(&row.field))
-        settings.*(*integer) = static_cast<int64_t>(parse_number(row, text, true));
+    std::visit([&](auto field) { parse_value(row, text, settings.*field); }, row.field);
 }
 
 // `source`: the command line, the preset, the method or a row of `task_rows`.
@@ -387,16 +385,16 @@ inline Settings default_settings(const std::string& task, const std::string& met
 
 // Conditions on several settings at once. Errors: usage.setting.
 inline void check_together(const Settings& settings) {
-    const long long width = settings.width, heads = settings.heads;
+    const long long width = settings.width, heads = settings.heads, batch_size = settings.batch_size;
+    const long long context_length = settings.context_length, online_steps = settings.online_steps;
     if (width % heads != 0)
         fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", width, heads,
              (width / heads + 1) * heads);
-    if (settings.batch_size * settings.context_length > 1000000)
+    if (batch_size * context_length > 1000000)
         fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
-             static_cast<long long>(settings.batch_size), static_cast<long long>(settings.context_length));
-    if (settings.online_steps > 0 && settings.method == "dt")
-        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
-             static_cast<long long>(settings.online_steps));
+             batch_size, context_length);
+    if (online_steps > 0 && settings.method == "dt")
+        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
     const bool gridworld = settings.task == "gridworld";
     if (gridworld != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
