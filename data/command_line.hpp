@@ -5,21 +5,13 @@
 // word, and exit status 2; other failures exit with 1.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <csignal>
-#include <cstdint>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
-#include <map>
 #include <new>
 #include <set>
-#include <span>
-#include <string>
-#include <string_view>
 #include <thread>
-#include <vector>
 
 #include "../nn.hpp"
 #include "d4rl.hpp"

@@ -2,12 +2,8 @@
 // the list of tasks.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <cstdio>
 #include <filesystem>
-#include <string>
-#include <vector>
 
 #include "d4rl.hpp"
 #include "safetensors.hpp"
@@ -122,10 +118,7 @@ inline void print_info(const std::string& path, const std::string& task) {
         print_tensors(path);
 }
 
-// ---------------------------------------------------------------------------------------------------------------------
-// Tasks.
-
-// The command `tasks`.
+// The command `tasks` without a task.
 inline void print_tasks() {
     const EnvironmentSpec spec = GridWorld{}.spec();
     std::printf("%-30s %3d state numbers, %d moves, at most %d steps; data set: a fixed policy's, made on the spot\n",

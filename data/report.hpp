@@ -564,14 +564,13 @@ inline std::string compared(const Runs& runs, Quantity quantity, const PaperResu
 inline std::string verdict(const Group& group) {
     const Run& any = group.any();
     if (!paper_result(any)) return "";
-    std::string out;
-    double interactions = 0;
+    std::string out = group.heading + ", final " + group.unit + ": ";
     for (size_t i = group.by_method.size(); i-- > 0;) {
         const Runs& runs = group.by_method[i];
-        out += out.empty() ? group.heading + ", final " + group.unit + ": " : "; ";
-        out += compared(runs, group.quantity, *paper_result(*runs[0]));
-        for (const Run* run : runs) interactions = std::max(interactions, run->so_far);
+        out += compared(runs, group.quantity, *paper_result(*runs[0])) + (i > 0 ? "; " : "");
     }
+    double interactions = 0;
+    for (const Run* run : group.runs) interactions = std::max(interactions, run->so_far);
     if (interactions > 0)
         out += "; online interactions: up to " + svg::grouped(interactions, 0) + ", paper " +
                (any.mujoco ? "200,000" : "20,000");

@@ -17,13 +17,9 @@
 
 #include <array>
 #include <cerrno>
-#include <cmath>
-#include <cstdint>
 #include <cstdio>
 #include <cstring>
 #include <filesystem>
-#include <string>
-#include <vector>
 
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"

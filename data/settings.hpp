@@ -8,6 +8,7 @@
 //
 // Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
 // an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
+// The other headers of data/ that include this one have what it includes.
 #pragma once
 
 #include <algorithm>
@@ -483,43 +484,37 @@ inline void require_same_settings(const Settings& found, const Settings& wanted,
 
 inline TransformerConfig transformer_config(const Settings& settings, const EnvironmentSpec& spec) {
     const bool discrete = spec.discrete_actions > 0;
-    TransformerConfig config;
-    config.state_dim = spec.state_dim;
-    config.action_dim = discrete ? spec.discrete_actions : spec.action_dim;  // a discrete action is a one-hot vector
-    config.layers = static_cast<int>(settings.layers);
-    config.heads = static_cast<int>(settings.heads);
-    config.width = static_cast<int>(settings.width);
-    config.max_timesteps = settings.position ? 1000 : 0;  // ODT's code: a table of 1000 rows
-    config.dropout = static_cast<float>(settings.dropout);
-    config.head = discrete                  ? Head::categorical
-                  : settings.method == "dt" ? Head::deterministic
-                                            : Head::squashed_gaussian;
-    return config;
+    const Head continuous_head = settings.method == "dt" ? Head::deterministic : Head::squashed_gaussian;
+    return {.state_dim = spec.state_dim,
+            .action_dim = discrete ? spec.discrete_actions : spec.action_dim,  // a discrete action is a one-hot vector
+            .layers = static_cast<int>(settings.layers),
+            .heads = static_cast<int>(settings.heads),
+            .width = static_cast<int>(settings.width),
+            .max_timesteps = settings.position ? 1000 : 0,  // ODT's code: a table of 1000 rows
+            .dropout = static_cast<float>(settings.dropout),
+            .head = discrete ? Head::categorical : continuous_head};
 }
 
 inline OptimizerConfig optimizer_config(const Settings& settings) {
-    OptimizerConfig config;
-    config.rule = settings.optimizer == "lamb" ? OptimizerConfig::Rule::lamb : OptimizerConfig::Rule::adamw;
-    config.learning_rate = settings.learning_rate;
-    config.weight_decay = settings.weight_decay;
-    config.always_adapt = settings.lamb_always_adapt;
-    config.clip_norm = settings.clip_norm;
-    config.warmup_updates = static_cast<uint64_t>(settings.warmup_updates);
-    return config;
+    using Rule = OptimizerConfig::Rule;
+    return {.rule = settings.optimizer == "lamb" ? Rule::lamb : Rule::adamw,
+            .learning_rate = settings.learning_rate,
+            .weight_decay = settings.weight_decay,
+            .always_adapt = settings.lamb_always_adapt,
+            .clip_norm = settings.clip_norm,
+            .warmup_updates = static_cast<uint64_t>(settings.warmup_updates)};
 }
 
 inline MemoryConfig memory_config(const Settings& settings, const EnvironmentSpec& spec) {
-    MemoryConfig config{};
-    config.state_dim = spec.state_dim;
-    config.action_dim = spec.action_dim;
-    config.projected_dim = static_cast<int>(settings.projected_dim);
-    config.capacity = static_cast<size_t>(settings.table_size);
-    config.K = static_cast<int>(settings.K);
-    config.epsilon = settings.epsilon;
-    config.tau = settings.tau;
-    config.exclude_self = settings.exclude_self;
-    config.eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru;
-    return config;
+    return {.state_dim = spec.state_dim,
+            .action_dim = spec.action_dim,
+            .projected_dim = static_cast<int>(settings.projected_dim),
+            .capacity = static_cast<size_t>(settings.table_size),
+            .K = static_cast<int>(settings.K),
+            .epsilon = settings.epsilon,
+            .tau = settings.tau,
+            .exclude_self = settings.exclude_self,
+            .eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru};
 }
 
 inline GridWorld make_grid_world(const Settings& settings) {
