@@ -5,21 +5,13 @@
 // word, and exit status 2; other failures exit with 1.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <csignal>
-#include <cstdint>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
-#include <map>
 #include <new>
 #include <set>
-#include <span>
-#include <string>
-#include <string_view>
 #include <thread>
-#include <vector>
 
 #include "../nn.hpp"
 #include "d4rl.hpp"
@@ -104,19 +96,7 @@ inline std::vector<Option> options_of(const Command& command) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Parsing and help.
 
-// Errors: usage.option names the nearest option of the command.
-inline const Option& option_named(const Command& command, const std::vector<Option>& taken, const std::string& word) {
-    std::vector<std::string> names;
-    for (const Option& option : taken) {
-        if (word == option.name) return option;
-        names.push_back(option.name);
-    }
-    if (names.empty()) fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, word.c_str());
-    fail("usage.option", "wodtem %s has no option \"%s\"; the nearest is %s", command.name, word.c_str(),
-         nearest_name(word, names).c_str());
-}
-
-// Errors: usage.option, usage.words.
+// Errors: usage.option, which names the nearest option of the command; usage.words.
 inline Arguments parse_arguments(const Command& command, const std::vector<std::string>& words) {
     const std::vector<Option> taken = options_of(command);
     Arguments arguments;
@@ -127,7 +107,11 @@ inline Arguments parse_arguments(const Command& command, const std::vector<std::
             arguments.words.push_back(words[i]);
             continue;
         }
-        const Option& option = option_named(command, taken, words[i]);
+        if (taken.empty())
+            fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
+        const Option& option =
+            row_named(taken, words[i], "usage.option",
+                      std::string("wodtem ") + command.name + " has no option \"%s\"; the nearest is %s");
         if (!option.value) {
             arguments.options[option.name] = "yes";
             continue;
@@ -169,35 +153,25 @@ inline void print_help(const Command& command) {
     if (command.notes) std::printf("%s", command.notes().c_str());
 }
 
-inline void flush_results() {
-    if (std::fflush(stdout) != 0 || std::ferror(stdout))
-        fail("console.write", "cannot write the results to stdout: is the disk full?");
-}
-
-// Returns the exit status. Errors: usage.command, and those of the command.
+// Returns the exit status. Errors: usage.command, console.write, and those of the command.
 inline int run_command_line(std::span<const Command> commands, const std::vector<std::string>& words) {
     const auto asks_for_help = [](const std::string& word) {
         return word == "--help" || word == "-h" || word == "help";
     };
     if (words.empty() || asks_for_help(words[0])) {
         print_command_list(commands);
-        flush_results();
-        return words.empty() ? 2 : 0;
-    }
-    std::vector<std::string> names;
-    for (const Command& command : commands) {
-        names.push_back(command.name);
-        if (words[0] != command.name) continue;
+    } else {
+        const Command& command = row_named(commands, words[0], "usage.command",
+                                           "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)");
         const std::vector<std::string> rest(words.begin() + 1, words.end());
         if (std::any_of(rest.begin(), rest.end(), asks_for_help))
             print_help(command);
         else
             command.run(parse_arguments(command, rest));
-        flush_results();
-        return 0;
     }
-    fail("usage.command", "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)", words[0].c_str(),
-         nearest_name(words[0], names).c_str());
+    if (std::fflush(stdout) != 0 || std::ferror(stdout))
+        fail("console.write", "cannot write the results to stdout: is the disk full?");
+    return words.empty() ? 2 : 0;
 }
 
 // The body of main(): every error becomes a sentence on stderr and an exit status.
@@ -206,15 +180,14 @@ inline int run_program(std::span<const Command> commands, const std::vector<std:
     std::signal(SIGXFSZ, SIG_IGN);  // the same for a limit on file sizes
     try {
         return run_command_line(commands, words);
-    } catch (const Error& error) {
-        std::fprintf(stderr, "wodtem: %s\n", error.what());
-        return error.id.starts_with("usage.") ? 2 : 1;
     } catch (const std::bad_alloc&) {
         std::fprintf(stderr, "wodtem: out of memory\n");
+        return 1;
     } catch (const std::exception& error) {
         std::fprintf(stderr, "wodtem: %s\n", error.what());
+        const auto* known = dynamic_cast<const Error*>(&error);
+        return known && known->id.starts_with("usage.") ? 2 : 1;
     }
-    return 1;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -376,6 +349,7 @@ inline std::string folder_of(const Arguments& arguments, const Settings& setting
 inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
     const std::vector<std::string> methods = split(one_or_several(arguments, "--method", "--methods", "wodtem"), ',');
     const std::vector<int64_t> seeds = seed_list(one_or_several(arguments, "--seed", "--seeds", "0"));
+    const size_t count = methods.size() * seeds.size();
     std::vector<PlannedRun> runs;
     for (const std::string& method : methods) {
         for (const int64_t seed : seeds) {
@@ -384,12 +358,11 @@ inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
                 settings.weights_path = model_path(arguments["--weights"]);
                 set_from(settings, "first_weights", sha256_of_file(settings.weights_path), "SHA-256 of the model file");
             }
+            const std::string place = std::to_string(runs.size() + 1) + " of " + std::to_string(count) + ": ";
             const std::string label = method_label(method) + ", seed " + std::to_string(seed);
-            runs.push_back({settings, folder_of(arguments, settings), label});
+            runs.push_back({settings, folder_of(arguments, settings), (count > 1 ? place : "") + label});
         }
     }
-    for (size_t i = 0; runs.size() > 1 && i < runs.size(); ++i)
-        runs[i].label = std::to_string(i + 1) + " of " + std::to_string(runs.size()) + ": " + runs[i].label;
     return runs;
 }
 

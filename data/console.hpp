@@ -20,12 +20,10 @@ inline double seconds_since(Clock::time_point then) {
 // 75 seconds are 1:15, 3675 are 1:01:15.
 inline std::string clock_text(double seconds) {
     const int whole = static_cast<int>(std::clamp(seconds, 0.0, 3599999.0));
+    const std::string hours = whole >= 3600 ? std::to_string(whole / 3600) + ":" : "";
     char text[32];
-    if (whole >= 3600)
-        std::snprintf(text, sizeof text, "%d:%02d:%02d", whole / 3600, whole / 60 % 60, whole % 60);
-    else
-        std::snprintf(text, sizeof text, "%d:%02d", whole / 60, whole % 60);
-    return text;
+    std::snprintf(text, sizeof text, hours.empty() ? "%d:%02d" : "%02d:%02d", whole / 60 % 60, whole % 60);
+    return hours + text;
 }
 
 // Set by SIGINT and SIGTERM: a long command then saves its state and ends. A signal handler can reach nothing but a
@@ -52,8 +50,7 @@ struct Console {
 
     // share: how much of the phase is done, 0 to 1. later: seconds expected after the phase. details(): the line's end,
     // called only when a line is drawn.
-    template <class Details>
-    void show(const std::string& new_phase, double share, double later, Details&& details) {
+    void show(const std::string& new_phase, double share, double later, auto&& details) {
         if (phase != new_phase) {
             phase = new_phase;
             phase_began = Clock::now();

@@ -10,16 +10,13 @@
 // Promises: equal data give equal text in every locale; no scripts, fonts or other files are needed; all text is
 // escaped; numbers that are NaN, or 1e15 and beyond, break a line or leave a bar out and are never written.
 // Leaves out: knowledge of what is drawn (labels come from the caller, in UTF-8), interaction, exact text widths.
-// Order: SVG elements; the whole figure; axes; charts; maps of cells; tables and pages.
+// Order: SVG elements; the whole figure; charts; maps of cells; tables and pages.
 #pragma once
 
 #include <algorithm>
 #include <charconv>
 #include <cmath>
-#include <functional>
-#include <limits>
 #include <string>
-#include <string_view>
 #include <utility>
 #include <variant>
 #include <vector>
@@ -152,7 +149,7 @@ inline std::string picture(double w, double y, const std::string& title, std::st
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Axes
+// Charts: axes, then what lies on them
 
 struct Tick {
     double value;
@@ -161,7 +158,7 @@ struct Tick {
 
 // Maps values low..high to coordinates from..to; other values are drawn at the nearer end.
 struct Axis {
-    double low = 0, high = 1, from = 0, to = 1;
+    double low, high, from, to;
     std::vector<Tick> ticks;
 
     double at(double value) const { return from + (to - from) * (std::clamp(value, low, high) - low) / (high - low); }
@@ -169,8 +166,8 @@ struct Axis {
 
 // About `count` steps of 1, 2 or 5 times a power of ten, both ends on a tick. The axis starts at 0 if less than half of
 // it is wasted. low > high: there is nothing to show, and the axis is 0..1.
-inline Axis linear_axis(double low, double high, int count) {
-    if (!(low <= high)) return linear_axis(0, 1, count);
+inline Axis linear_axis(double low, double high, int count, double from, double to) {
+    if (!(low <= high)) return linear_axis(0, 1, count, from, to);
     if (low > 0 && low <= 0.5 * high) low = 0;
     const double size = std::max(std::fabs(low), std::fabs(high));
     if (high - low < 1e-9 * size + 1e-30) {  // one value; also, `i` below must stay exact
@@ -180,16 +177,11 @@ inline Axis linear_axis(double low, double high, int count) {
     const double rough = (high - low) / count, power = std::pow(10.0, std::floor(std::log10(rough)));
     const double ratio = rough / power, step = power * (ratio < 1.5 ? 1 : ratio < 3 ? 2 : ratio < 7 ? 5 : 10);
     const int decimals = std::clamp(-static_cast<int>(std::floor(std::log10(step) + 1e-9)), 0, 12);
-    Axis axis;
+    std::vector<Tick> ticks;
     for (double i = std::floor(low / step + 1e-9); i <= std::ceil(high / step - 1e-9); ++i)
-        axis.ticks.push_back({i * step, grouped(i * step, decimals)});
-    axis.low = axis.ticks.front().value;
-    axis.high = axis.ticks.back().value;
-    return axis;
+        ticks.push_back({i * step, grouped(i * step, decimals)});
+    return {ticks.front().value, ticks.back().value, from, to, ticks};
 }
-
-// ---------------------------------------------------------------------------------------------------------------------
-// Charts
 
 inline constexpr double plot_top = 50, plot_bottom = 350, plot_right = width - 40;
 
@@ -217,22 +209,13 @@ struct Chart {
     size_t points() const { return bars() ? categories.size() : x.size(); }
 };
 
-// Errors: figure.length if a series has not one number for each x or category.
-inline void check_lengths(const Chart& chart) {
-    for (const Series& s : chart.series)
-        if (s.mean.size() != chart.points() || s.deviation.size() != chart.points())
-            fail("figure.length", "figure \"%s\": \"%s\" has %zu means and %zu deviations, expected %zu of each",
-                 chart.title.c_str(), s.label.c_str(), s.mean.size(), s.deviation.size(), chart.points());
-}
-
 // The deviation of point i, or 0 if there is none.
 inline double deviation_at(const Series& s, size_t i) { return drawable(s.deviation[i]) ? s.deviation[i] : 0; }
 
 // The axis covers the points with their bands or error bars, and the marks; of bars the zero too. Bands of numbers that
 // are not negative are cut at zero.
 inline Axis y_axis(const Chart& chart) {
-    const double infinity = std::numeric_limits<double>::infinity();
-    double low = chart.bars() ? 0 : infinity, high = chart.bars() ? 0 : -infinity, least = infinity;
+    double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY, least = INFINITY;
     const auto include = [&](double mean, double deviation) {
         if (!drawable(mean)) return;
         low = std::min(low, mean - deviation);
@@ -243,26 +226,18 @@ inline Axis y_axis(const Chart& chart) {
         for (size_t i = 0; i < s.mean.size(); ++i) include(s.mean[i], deviation_at(s, i));
     for (const Mark& mark : chart.marks) include(mark.value, 0);
     if (least >= 0) low = std::max(low, 0.0);
-    Axis axis = linear_axis(low, high, 5);
-    axis.from = plot_bottom;
-    axis.to = plot_top;
-    return axis;
+    return linear_axis(low, high, 5, plot_bottom, plot_top);
 }
 
 // Lines end with their last point, between ticks or not; each bar's category has a slot of width 1 around its index.
 inline Axis x_axis(const Chart& chart, double left) {
-    Axis axis = chart.x.empty() ? linear_axis(0, 1, 6) : linear_axis(chart.x.front(), chart.x.back(), 6);
+    const bool empty = chart.x.empty();
+    Axis axis = linear_axis(empty ? 0 : chart.x.front(), empty ? 1 : chart.x.back(), 6, left, plot_right);
     if (chart.x.size() > 1) axis.high = chart.x.back();
     std::erase_if(axis.ticks, [&](const Tick& tick) { return tick.value > axis.high; });
-    if (chart.bars()) {
-        axis.ticks.clear();
-        axis.low = -0.5;
-        axis.high = static_cast<double>(chart.categories.size()) - 0.5;
-        for (const std::string& category : chart.categories)
-            axis.ticks.push_back({static_cast<double>(axis.ticks.size()), category});
-    }
-    axis.from = left;
-    axis.to = plot_right;
+    if (chart.bars()) axis = {-0.5, static_cast<double>(chart.categories.size()) - 0.5, left, plot_right, {}};
+    for (const std::string& category : chart.categories)
+        axis.ticks.push_back({static_cast<double>(axis.ticks.size()), category});
     return axis;
 }
 
@@ -300,9 +275,7 @@ inline void draw_line(const Series& s, const Chart& chart, const Axis& x, const 
         if (i + 1 < chart.points() && drawable(s.mean[i + 1])) continue;
         bands += path(upper + lower + "Z", fill(s.colour) + " fill-opacity=\"0.18\"");
         lines += path(middle, line_style(s)) + circle(px, y.at(s.mean[i]), 3, fill(s.colour));
-        middle.clear();
-        upper.clear();
-        lower.clear();
+        middle = upper = lower = "";
     }
 }
 
@@ -327,9 +300,13 @@ inline std::string diamond(double x, double y, const char* colour) {
     return path(point(x - 5, y) + point(x, y - 7) + point(x + 5, y) + point(x, y + 7) + "Z", fill(colour));
 }
 
-// Lines with their bands, or bars in groups; marks beside them; the legend below. Errors: figure.length.
+// Lines with their bands, or bars in groups; marks beside them; the legend below.
+// Errors: figure.length if a series has not one number for each x or category.
 inline std::string draw_chart(const Chart& chart) {
-    check_lengths(chart);
+    for (const Series& s : chart.series)
+        if (s.mean.size() != chart.points() || s.deviation.size() != chart.points())
+            fail("figure.length", "figure \"%s\": \"%s\" has %zu means and %zu deviations, expected %zu of each",
+                 chart.title.c_str(), s.label.c_str(), s.mean.size(), s.deviation.size(), chart.points());
     const Axis y = y_axis(chart);
     double widest = 0;
     for (const Tick& tick : y.ticks) widest = std::max(widest, text_width(tick.label));
@@ -363,48 +340,11 @@ inline std::string draw_chart(const Chart& chart) {
 struct Place {
     double row, column;
 };
-// From the middle of a cell towards a neighbour, longer and darker the more probable.
-struct Arrow {
-    Place place;
-    int drow, dcolumn;  // -1, 0 or 1, not both 0
-    double probability;
-};
-struct Circle {
-    Place place;
-    double radius;  // in cells
-    const char* colour;
-};
-// A letter in a coloured disc.
-struct Letter {
-    Place place;
-    const char *letter, *colour;
-};
-struct Path {
-    std::vector<Place> places;  // from the start to the end; all are numbers
-    const char* colour;
-};
-struct CellMap {
-    std::string title;
-    int rows, columns;
-    const char* fill_colour;         // of `filled`
-    std::vector<Place> filled = {};  // cells
-    std::vector<Arrow> arrows = {};
-    std::vector<Letter> letters = {};
-    std::vector<Circle> circles = {};
-    std::vector<Path> paths = {};
-    std::vector<Key> keys = {};  // of the legend
 
-    static constexpr double left = 48, top = 76;
-    double size() const { return std::min(600.0 / columns, 480.0 / rows); }  // of a cell
-    // A place outside of the map is drawn on its edge.
-    double x(double column) const { return left + size() * (std::clamp(column, -0.5, columns - 0.5) + 0.5); }
-    double y(double row) const { return top + size() * (std::clamp(row, -0.5, rows - 0.5) + 0.5); }
-};
-
-// An arrow centred at (x, y) in a cell of this size.
-inline std::string arrow_mark(double x, double y, const Arrow& arrow, double size) {
-    const double norm = std::hypot(arrow.drow, arrow.dcolumn), p = arrow.probability;
-    const double ux = arrow.dcolumn / norm, uy = arrow.drow / norm;  // unit vector along the arrow
+// An arrow in a cell of this size, centred at (x, y), towards a neighbour: drow and dcolumn are -1, 0 or 1, not both 0.
+// It is longer and darker the larger the probability p.
+inline std::string arrow_mark(double x, double y, int drow, int dcolumn, double p, double size) {
+    const double norm = std::hypot(drow, dcolumn), ux = dcolumn / norm, uy = drow / norm;  // unit vector along it
     const double half = size * (0.14 + 0.2 * p), head = 0.13 * size, side = 0.6 * head;
     const double tip_x = x + ux * half, tip_y = y + uy * half;
     const double neck_x = tip_x - ux * head, neck_y = tip_y - uy * head;
@@ -430,45 +370,58 @@ inline std::string end_mark(double x, double y, const char* colour) {
     return out;
 }
 
-// Filled cells, the lines between all cells, and the numbers of rows and columns from 0.
-inline std::string draw_cells(const CellMap& map) {
+// A map of square cells. What is added lies in layers, which are named here from below to above: filled cells, below
+// the lines between cells; arrows and circles; paths; their starts and ends, and letters.
+struct CellMap {
+    std::string title;
+    int rows, columns;
+    std::string filled = {}, marks = {}, paths = {}, ends = {};
+    std::vector<Key> keys = {};  // of the legend
+
+    static constexpr double left = 48, top = 76;
+    double size() const { return std::min(600.0 / columns, 480.0 / rows); }  // of a cell
+    // A place outside of the map is drawn on its edge.
+    double x(double column) const { return left + size() * (std::clamp(column, -0.5, columns - 0.5) + 0.5); }
+    double y(double row) const { return top + size() * (std::clamp(row, -0.5, rows - 0.5) + 0.5); }
+
+    void fill_cell(Place cell, const char* colour) {
+        filled += rectangle(x(cell.column - 0.5), y(cell.row - 0.5), size(), size(), fill(colour));
+    }
+    void add_arrow(Place cell, int drow, int dcolumn, double p) {
+        marks += arrow_mark(x(cell.column), y(cell.row), drow, dcolumn, p, size());
+    }
+    void add_circle(Place middle, double radius, const char* colour) {  // radius: in cells
+        marks += circle(x(middle.column), y(middle.row), size() * radius, stroke(colour, 1.5));
+    }
+    void add_path(const std::vector<Place>& places, const char* colour) {  // from the start to the end; all are numbers
+        std::string points;
+        for (const Place& place : places) points += point(x(place.column), y(place.row));
+        paths += path(points, stroke(colour, 2) + " stroke-opacity=\"0.7\"");
+        ends += start_mark(x(places.front().column), y(places.front().row), colour) +
+                end_mark(x(places.back().column), y(places.back().row), colour);
+    }
+    void add_letter(Place cell, const char* letter, const char* colour) {  // in a disc at the upper left of the cell
+        const double middle = x(cell.column - 0.5) + 14, height = y(cell.row - 0.5) + 14;
+        ends += circle(middle, height, 11, fill(colour)) +
+                text(middle, height + 5, letter, std::string(centred) + " " + fill(white));
+    }
+};
+
+// The layers, the lines between cells, and the numbers of rows and columns from 0.
+inline std::string draw_map(const CellMap& map) {
     const double right = map.x(map.columns), bottom = map.y(map.rows);
-    std::string out;
-    for (const Place& cell : map.filled)
-        out +=
-            rectangle(map.x(cell.column - 0.5), map.y(cell.row - 0.5), map.size(), map.size(), fill(map.fill_colour));
+    std::string cells = map.filled;
     for (int row = 0; row <= map.rows; ++row) {
         const double edge = map.y(row - 0.5);
-        out += line(map.left, edge, right, edge, stroke("#B0B0B0", 1));
-        if (row < map.rows) out += text(map.left - 10, map.y(row) + 4.5, std::to_string(row), flush_right);
+        cells += line(map.left, edge, right, edge, stroke("#B0B0B0", 1));
+        if (row < map.rows) cells += text(map.left - 10, map.y(row) + 4.5, std::to_string(row), flush_right);
     }
     for (int column = 0; column <= map.columns; ++column) {
         const double edge = map.x(column - 0.5);
-        out += line(edge, map.top, edge, bottom, stroke("#B0B0B0", 1));
-        if (column < map.columns) out += text(map.x(column), map.top - 9, std::to_string(column), centred);
+        cells += line(edge, map.top, edge, bottom, stroke("#B0B0B0", 1));
+        if (column < map.columns) cells += text(map.x(column), map.top - 9, std::to_string(column), centred);
     }
-    return out;
-}
-
-// From below to above: cells, arrows, circles, paths, their starts and ends, letters.
-inline std::string draw_map(const CellMap& map) {
-    std::string marks = draw_cells(map), ends;
-    for (const Arrow& arrow : map.arrows)
-        marks += arrow_mark(map.x(arrow.place.column), map.y(arrow.place.row), arrow, map.size());
-    for (const Circle& c : map.circles)
-        marks += circle(map.x(c.place.column), map.y(c.place.row), map.size() * c.radius, stroke(c.colour, 1.5));
-    for (const auto& [places, colour] : map.paths) {
-        std::string points;
-        for (const Place& place : places) points += point(map.x(place.column), map.y(place.row));
-        marks += path(points, stroke(colour, 2) + " stroke-opacity=\"0.7\"");
-        ends += start_mark(map.x(places.front().column), map.y(places.front().row), colour) +
-                end_mark(map.x(places.back().column), map.y(places.back().row), colour);
-    }
-    for (const auto& [place, letter, colour] : map.letters) {  // at the upper left of the cell
-        const double x = map.x(place.column - 0.5) + 14, y = map.y(place.row - 0.5) + 14;
-        ends += circle(x, y, 11, fill(colour)) + text(x, y + 5, letter, std::string(centred) + " " + fill(white));
-    }
-    return picture(map.x(map.columns) + 24, map.y(map.rows) + 28, map.title, marks + ends, map.keys);
+    return picture(right + 24, bottom + 28, map.title, cells + map.marks + map.paths + map.ends, map.keys);
 }
 
 }  // namespace svg
@@ -490,23 +443,6 @@ struct Section {
     std::vector<Part> parts;
     std::string verdict = "";  // one sentence for the top of the page, or empty
 };
-
-// A column's title, and its text for a row; Row is what a row of the table tells of, such as a run.
-template <class Row>
-struct Column {
-    std::string title;
-    std::function<std::string(const Row&)> cell;
-};
-template <class Row>
-Table make_table(const std::vector<Row>& rows, const std::vector<Column<Row>>& columns) {
-    Table table;
-    for (const Column<Row>& column : columns) table.header.push_back(column.title);
-    for (const Row& row : rows) {
-        std::vector<std::string>& cells = table.rows.emplace_back();
-        for (const Column<Row>& column : columns) cells.push_back(column.cell(row));
-    }
-    return table;
-}
 
 // One line of fields, filled up with spaces to the widths of their columns; the first is flush left.
 inline std::string markdown_row(const std::vector<std::string>& fields, const std::vector<size_t>& widths) {
@@ -570,8 +506,7 @@ struct Html {
 };
 
 // The title, all verdicts, then the sections.
-template <class Writer>
-std::string page(const Writer& writer, const std::string& title, const std::vector<Section>& sections) {
+inline std::string page(const auto& writer, const std::string& title, const std::vector<Section>& sections) {
     std::string out = writer.heading(1, title);
     for (const Section& section : sections)
         if (!section.verdict.empty()) out += writer(section.verdict);

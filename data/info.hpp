@@ -2,12 +2,8 @@
 // the list of tasks.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
 #include <cstdio>
 #include <filesystem>
-#include <string>
-#include <vector>
 
 #include "d4rl.hpp"
 #include "safetensors.hpp"
@@ -89,23 +85,12 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
     return text + (others > 0 ? ", NOT FINITE: " + std::to_string(others) : std::string());
 }
 
-inline std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
-    switch (tensor.dtype) {
-        case DType::F32:
-            return value_range<float>(file, tensor);
-        case DType::F64:
-            return value_range<double>(file, tensor);
-        case DType::U8:
-            return value_range<uint8_t>(file, tensor);
-        case DType::U32:
-            return value_range<uint32_t>(file, tensor);
-        case DType::U64:
-            return value_range<uint64_t>(file, tensor);
-        case DType::I64:
-            return value_range<int64_t>(file, tensor);
-        default:
-            return "";
-    }
+// Of a tensor whose type is one of Types; "" for any other.
+template <class... Types>
+std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
+    std::string range;
+    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range<Types>(file, tensor)) : void()), ...);
+    return range;
 }
 
 inline void print_tensors(const std::string& path) {
@@ -121,7 +106,8 @@ inline void print_tensors(const std::string& path) {
     }
     for (const StoredTensor& tensor : file.tensors)
         std::printf("%-44s %s %-14s %s\n", tensor.name.c_str(), about(tensor.dtype).name,
-                    shape_text(tensor.shape).c_str(), range_of(file, tensor).c_str());
+                    shape_text(tensor.shape).c_str(),
+                    range_of<float, double, uint8_t, uint32_t, uint64_t, int64_t>(file, tensor).c_str());
 }
 
 // The command `info`. task: a task's id, or "".
@@ -132,10 +118,7 @@ inline void print_info(const std::string& path, const std::string& task) {
         print_tensors(path);
 }
 
-// ---------------------------------------------------------------------------------------------------------------------
-// Tasks.
-
-// The command `tasks`.
+// The command `tasks` without a task.
 inline void print_tasks() {
     const EnvironmentSpec spec = GridWorld{}.spec();
     std::printf("%-30s %3d state numbers, %d moves, at most %d steps; data set: a fixed policy's, made on the spot\n",

@@ -2,13 +2,8 @@
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
 // length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
 //
-// Reads from each folder:  settings            the text form of Settings
-//                          progress.csv        one row per evaluation, the first at the end of the offline phase
-//                          episodes.csv        one row per online episode
-//                          finished            an empty file; without it the logs above may be missing or incomplete
-//   mazes, if it is there: paths.csv           one row per state of the latest evaluation's episodes
-//   finished grid worlds:  policy.csv          probability of each move in each cell
-//                          start_actions.csv   share of each move at S: learned, D_offline, D_online
+// Reads what run_folder.hpp writes: settings, progress.csv, episodes.csv (without the file `finished` these logs may be
+// missing or incomplete); of mazes paths.csv, if it is there; of finished grid worlds policy.csv and start_actions.csv.
 // Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; seeds are
 // averaged only if nothing but the seed was set differently, and the physics were the same; errors name file and line.
 // Leaves out: networks, statistics beyond mean and standard deviation, judging whether a difference matters.
@@ -16,7 +11,6 @@
 #pragma once
 
 #include <array>
-#include <cstdint>
 #include <filesystem>
 #include <map>
 #include <tuple>
@@ -49,7 +43,7 @@ inline Table parse_csv(const std::string& text, const std::string& path) {
 
 namespace results {  // the training program has names of its own: Run, Spread, ...
 
-constexpr double none = std::numeric_limits<double>::quiet_NaN();
+constexpr double none = NAN;
 
 // A CSV file with its path, which its errors name.
 struct Log {
@@ -122,7 +116,7 @@ using MoveShares = std::array<double, grid_moves>;
 struct MazeEpisode {
     double goal_x, goal_y;           // m, as observed
     bool reached;                    // some state lies within goal_radius of the goal
-    std::vector<svg::Place> places;  // of each state, on the map
+    std::vector<svg::Place> places;  // of each state, on the map or outside of it
 };
 
 struct Run {
@@ -142,8 +136,9 @@ struct Run {
     bool offline_only() const { return method == 0; }
     std::string name() const { return about_method().label + (" seed " + std::to_string(settings.seed)); }
 };
-using Runs = std::vector<const Run*>;         // of one method unless said otherwise, by seed; never empty
-using Quantity = std::vector<double> Run::*;  // length, total or score
+using Runs = std::vector<const Run*>;              // of one method unless said otherwise, by seed; never empty
+using Quantity = std::vector<double> Run::*;       // length, total or score
+using Summary = double (*)(const Run&, Quantity);  // final_value or last_ten
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
 inline std::vector<MoveShares> read_policy(const Log& log) {
@@ -170,12 +165,6 @@ inline std::array<std::vector<double>, 3> read_start_actions(const Log& log) {
     return {log.numbers("learned", 0, 1), log.numbers("offline", 0, 1), log.numbers("online", 0, 1, true)};
 }
 
-// An observed position (m) on the map, in cells; it may lie outside of the map.
-inline svg::Place place_on_map(const MujocoTask& task, double x, double y) {
-    const auto [row, column] = maze_place(task, x, y);
-    return {row, column};
-}
-
 // paths.csv: episodes count from 0, and in each of them its steps; an episode keeps its goal.
 // Errors: csv.order, csv.number.
 inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& log) {
@@ -193,54 +182,48 @@ inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& lo
                  "episode keeps its goal",
                  log.path.c_str(), i + 2, episode[i], step[i]);
         MazeEpisode& latest = out.back();
-        latest.places.push_back(place_on_map(task, x[i], y[i]));
+        const auto [row, column] = maze_place(task, x[i], y[i]);
+        latest.places.push_back({row, column});
         latest.reached = latest.reached || std::hypot(x[i] - goal_x[i], y[i] - goal_y[i]) <= goal_radius;
     }
     return out;
 }
 
-// progress.csv and episodes.csv. A run that has just begun may not have them yet. Errors: those of Log.
-inline void read_logs(Run& run) {
-    const auto present = [&](const std::string& path) { return run.finished || std::filesystem::exists(path); };
-    const std::string progress = run.folder + "/progress.csv", episodes = run.folder + "/episodes.csv";
-    if (present(progress)) {
-        const Log log(progress);
+// All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
+inline Run read_run(const std::string& folder) {
+    const auto file = [&](const char* name) { return folder + "/" + name; };
+    const auto exists = [&](const char* name) { return std::filesystem::exists(file(name)); };
+    if (!exists("settings"))
+        fail("report.folder", "%s: is no run folder: it has no file `settings`, which training writes first",
+             folder.c_str());
+    Run run;
+    run.folder = folder;
+    run.settings = settings_from_text(read_file(file("settings")), file("settings"));
+    while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
+    run.mujoco = find_mujoco_task(run.settings.task);
+    if (run.mujoco && run.settings.physics == "none")
+        fail("report.setting", "%s: %s cannot have physics none", file("settings").c_str(), run.settings.task.c_str());
+    run.finished = exists("finished");
+    if (run.finished || exists("progress.csv")) {  // a run that has just begun may not have its logs yet
+        const Log log(file("progress.csv"));
         run.interactions = log.interactions();
         run.length = log.results("eval_length");
         run.total = log.results("eval_return");
         run.score = log.results("eval_score");
+        if (!run.interactions.empty()) run.so_far = run.interactions.back();
     }
-    if (present(episodes) && !run.offline_only()) {
-        const Log log(episodes);
+    if (!run.offline_only() && (run.finished || exists("episodes.csv"))) {
+        const Log log(file("episodes.csv"));
         run.episode_length = log.numbers("length", 1, run.mujoco ? 1e9 : grid_max_steps);
         run.episode_return = log.results("return");
         const std::vector<double> at = log.interactions();
-        if (!at.empty()) run.so_far = at.back();
+        if (!at.empty()) run.so_far = std::max(run.so_far, at.back());
     }
-    if (!run.interactions.empty()) run.so_far = std::max(run.so_far, run.interactions.back());
-}
-
-// All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
-inline Run read_run(const std::string& folder) {
-    Run run;
-    run.folder = folder;
-    const std::string settings = folder + "/settings", paths = folder + "/paths.csv";
-    if (!std::filesystem::exists(settings))
-        fail("report.folder", "%s: is no run folder: it has no file `settings`, which training writes first",
-             folder.c_str());
-    run.settings = settings_from_text(read_file(settings), settings);
-    const auto has_name = [&](const Method& method) { return run.settings.method == method.name; };
-    run.method = std::find_if(methods.begin(), methods.end(), has_name) - methods.begin();
-    run.mujoco = find_mujoco_task(run.settings.task);
-    if (run.mujoco && run.settings.physics == "none")
-        fail("report.setting", "%s: %s cannot have physics none", settings.c_str(), run.settings.task.c_str());
-    run.finished = std::filesystem::exists(folder + "/finished");
-    read_logs(run);
-    if (run.mujoco && run.mujoco->maze && std::filesystem::exists(paths))
-        run.paths = read_paths(*run.mujoco, Log(paths));
+    if (run.mujoco && run.mujoco->maze && exists("paths.csv"))
+        run.paths = read_paths(*run.mujoco, Log(file("paths.csv")));
     if (run.mujoco || !run.finished) return run;
-    run.policy = read_policy(Log(folder + "/policy.csv"));
-    if (!run.offline_only()) run.start_actions = read_start_actions(Log(folder + "/start_actions.csv"));
+    run.policy = read_policy(Log(file("policy.csv")));
+    if (!run.offline_only()) run.start_actions = read_start_actions(Log(file("start_actions.csv")));
     return run;
 }
 
@@ -273,8 +256,7 @@ inline std::string plus_minus(const Spread& spread) {
 }
 
 // Mean and deviation over runs of each entry of row_of(run), a list that is equally long for all runs.
-template <class RowOf>
-svg::Series mean_series(const char* label, const char* colour, const Runs& runs, RowOf row_of) {
+inline svg::Series mean_series(const char* label, const char* colour, const Runs& runs, const auto& row_of) {
     std::vector<std::vector<double>> rows;
     for (const Run* run : runs) rows.push_back(row_of(*run));
     svg::Series out{label, colour, {}, {}};
@@ -304,19 +286,17 @@ inline double last_ten(const Run& run, Quantity quantity) {
     return spread_of(values).mean;
 }
 
-// Over runs, of final_value or last_ten.
-inline Spread spread_of(const Runs& runs, double (*number_of)(const Run&, Quantity), Quantity quantity) {
+inline Spread spread_of(const Runs& runs, Summary summary, Quantity quantity) {
     std::vector<double> values;
-    for (const Run* run : runs) values.push_back(number_of(*run, quantity));
+    for (const Run* run : runs) values.push_back(summary(*run, quantity));
     return spread_of(values);
 }
 
 // Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run;
 // long runs in larger steps, at most about 400. There are at least two points.
-inline std::vector<double> curve_points(const std::vector<Runs>& by_method) {
+inline std::vector<double> curve_points(const Runs& runs) {
     double largest = 250;
-    for (const Runs& runs : by_method)
-        for (const Run* run : runs) largest = std::max(largest, run->so_far);
+    for (const Run* run : runs) largest = std::max(largest, run->so_far);
     const double step = 250 * std::ceil(largest / 250 / 400);
     std::vector<double> out;
     for (double at = 0; at <= largest; at += step) out.push_back(at);
@@ -350,30 +330,16 @@ inline double shortest_met(const Run& run) {
     return out;
 }
 
-// The last length of each bar of the histogram; less than 5 occurs only on a torus.
-struct Bin {
-    int last;
-    const char* label;
-};
-constexpr std::array<Bin, 12> bins{{{5, "≤ 5"},
-                                    {6, "6"},
-                                    {7, "7"},
-                                    {8, "8"},
-                                    {9, "9"},
-                                    {10, "10"},
-                                    {15, "11–15"},
-                                    {20, "16–20"},
-                                    {30, "21–30"},
-                                    {50, "31–50"},
-                                    {99, "51–99"},
-                                    {100, "100"}}};
+// The last length of each bar of the histogram, and its label; less than 5 occurs only on a torus.
+constexpr std::array<int, 12> last_of_bar{5, 6, 7, 8, 9, 10, 15, 20, 30, 50, 99, 100};
+constexpr std::array<const char*, 12> bar_labels{"≤ 5",   "6",     "7",     "8",     "9",     "10",
+                                                 "11–15", "16–20", "21–30", "31–50", "51–99", "100"};
 
 // How many of the lengths belong to each bar.
 inline std::vector<double> count_lengths(const std::vector<double>& lengths) {
-    std::vector<double> out(bins.size(), 0);
+    std::vector<double> out(last_of_bar.size(), 0);
     for (const double length : lengths)
-        out[std::find_if(bins.begin(), bins.end() - 1, [&](Bin bin) { return length <= bin.last; }) - bins.begin()] +=
-            1;
+        out[std::lower_bound(last_of_bar.begin(), last_of_bar.end() - 1, length) - last_of_bar.begin()] += 1;
     return out;
 }
 
@@ -439,12 +405,13 @@ inline const PaperResult* paper_result(const Run& run) {
 
 // Runs of one task, preset and physics.
 struct Group {
-    std::vector<Runs> by_method;
+    Runs runs;                  // by method, then by seed
     std::string heading, file;  // file: the beginning of the figures' names
     Quantity quantity;          // which is compared with the paper
     const char* unit;           // its name
+    std::vector<Runs> by_method = {};
 
-    const Run& any() const { return *by_method.at(0)[0]; }
+    const Run& any() const { return *runs[0]; }
 };
 
 // Figs. 1b and 4a, and their like for other tasks: means over seeds. The paper's results are marked beside the curves
@@ -453,7 +420,7 @@ inline Figure curve(const Group& group, Quantity quantity, const std::string& ca
     const bool length = quantity == &Run::length;
     const char* label = length ? "evaluation length, steps" : "normalised score";
     svg::Chart chart{group.any().settings.task + ": " + label, "online interactions", label};
-    chart.x = curve_points(group.by_method);
+    chart.x = curve_points(group.runs);
     for (const Runs& runs : group.by_method) {
         const Method& method = runs[0]->about_method();
         chart.series.push_back(mean_series(method.label, method.colour, runs,
@@ -469,7 +436,7 @@ inline Figure curve(const Group& group, Quantity quantity, const std::string& ca
 // Fig. 1c, of the methods with an online phase.
 inline Figure histogram(const Group& group) {
     svg::Chart chart{"Lengths of the online episodes", "episode length, steps", "episodes per seed"};
-    for (const Bin& bin : bins) chart.categories.emplace_back(bin.label);
+    chart.categories.assign(bar_labels.begin(), bar_labels.end());
     for (const Runs& runs : group.by_method)
         if (!runs[0]->offline_only())
             chart.series.push_back(mean_series(runs[0]->about_method().label, runs[0]->about_method().colour, runs,
@@ -500,20 +467,21 @@ inline Figure start_actions(const Group& group, const Runs& runs) {
 
 // Fig. 1a shows the shortest path in this way; the paper does not show a learned one.
 inline Figure policy_map(const Group& group, const Run& run) {
+    const char* const path_colour = "#B9DAEF";
     const auto place = [](int cell) { return svg::Place(cell / grid_size, cell % grid_size); };
-    svg::CellMap map{"Learned policy: " + run.name(), grid_size, grid_size, "#B9DAEF"};
-    const std::vector<int> path =
-        greedy_path(run.policy, static_cast<EdgeRule>(index_of(edge_rule_names, run.settings.edge)));
-    for (const int cell : path) map.filled.push_back(place(cell));
+    svg::CellMap map{"Learned policy: " + run.name(), grid_size, grid_size};
+    const std::vector<int> path = greedy_path(run.policy, make_grid_world(run.settings).edge);
+    for (const int cell : path) map.fill_cell(place(cell), path_colour);
     for (int cell = 0; cell < grid_goal; ++cell) {  // no move is made at the goal, which is the last cell
         const int move = most_likely(run.policy[cell]);
         const auto& [name, word, drow, dcolumn] = grid_move_table[move];
-        map.arrows.push_back({place(cell), drow, dcolumn, run.policy[cell][move]});
+        map.add_arrow(place(cell), drow, dcolumn, run.policy[cell][move]);
     }
-    map.letters = {{place(grid_start), "S", svg::black}, {place(grid_goal), "G", svg::vermillion}};
-    map.keys.push_back({svg::rectangle(5, -8, 16, 16, svg::fill(map.fill_colour)), "path from S"});
+    map.add_letter(place(grid_start), "S", svg::black);
+    map.add_letter(place(grid_goal), "G", svg::vermillion);
+    map.keys = {{svg::rectangle(5, -8, 16, 16, svg::fill(path_colour)), "path from S"}};
     for (const double p : {0.25, 0.5, 1.0})
-        map.keys.push_back({svg::arrow_mark(13, 0, {{0, 0}, 0, 1, p}, 40), "p = " + svg::number(p)});
+        map.keys.push_back({svg::arrow_mark(13, 0, 0, 1, p, 40), "p = " + svg::number(p)});
     const std::string caption =
         "Compare the blue cells with fig. 1a of the paper. Arrows: the most likely move in each cell, with its "
         "probability p. These moves " +
@@ -531,12 +499,10 @@ constexpr std::array<const char*, 10> path_colours{"#0072B2", "#D55E00", "#009E7
 inline svg::CellMap maze_cells(const std::string& title, const std::string& map) {
     std::vector<std::string> rows = split(map, '/');
     rows.pop_back();
-    svg::CellMap out{title, 0, static_cast<int>(rows.at(0).size()), "#C8C8C8"};
-    for (const std::string& row : rows) {
+    svg::CellMap out{title, static_cast<int>(rows.size()), static_cast<int>(rows.at(0).size())};
+    for (int row = 0; row < out.rows; ++row)
         for (int column = 0; column < out.columns; ++column)
-            if (row[column] == '1') out.filled.push_back(svg::Place(out.rows, column));
-        ++out.rows;
-    }
+            if (rows[row][column] == '1') out.fill_cell(svg::Place(row, column), "#C8C8C8");
     out.keys = {{svg::start_mark(13, 0, svg::faint_ink), "start"},
                 {svg::end_mark(13, 0, svg::faint_ink), "end"},
                 {svg::circle(13, 0, 8, svg::stroke(svg::faint_ink, 1.5)), "goal (radius 0.5 m)"}};
@@ -550,14 +516,13 @@ inline Figure maze_map(const Group& group, const Run& run) {
     svg::CellMap map = maze_cells(run.settings.task + ": paths of " + run.name(), task.maze);
     const double radius = goal_radius / maze_cell_length(task);
     size_t reached = 0;
-    for (const MazeEpisode& episode : run.paths) {
+    for (size_t i = 0; i < run.paths.size(); ++i) {
+        const MazeEpisode& episode = run.paths[i];
         reached += episode.reached;
-        if (map.paths.size() == path_colours.size()) continue;
-        const char* colour = path_colours[map.paths.size()];
-        if (ant || map.circles.empty())
-            map.circles.push_back(
-                {place_on_map(task, episode.goal_x, episode.goal_y), radius, ant ? colour : svg::ink});
-        map.paths.push_back({episode.places, colour});
+        if (i >= path_colours.size()) continue;
+        const auto [row, column] = maze_place(task, episode.goal_x, episode.goal_y);
+        if (ant || i == 0) map.add_circle({row, column}, radius, ant ? path_colours[i] : svg::ink);
+        map.add_path(episode.places, path_colours[i]);
     }
     const std::string caption =
         "The latest evaluation of " + run.name() + (run.finished ? "" : ", unfinished") + ": " +
@@ -565,7 +530,7 @@ inline Figure maze_map(const Group& group, const Run& run) {
         " episodes came within 0.5 m of the goal" +
         (ant ? ", which ended them; each has a goal of its own, circled in its colour."
              : " at some time. None ends there: the score counts the steps within that distance.") +
-        (map.paths.size() < run.paths.size() ? " The first 10 are drawn." : "") +
+        (run.paths.size() > path_colours.size() ? " The first 10 are drawn." : "") +
         " The maze as its map is printed, walls grey; x runs " +
         (ant ? "to the right and y downwards." : "downwards and y to the right.");
     return {svg::draw_map(map), caption, group.file + "-paths-" + run.settings.method + ".svg"};
@@ -574,9 +539,8 @@ inline Figure maze_map(const Group& group, const Run& run) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tables and sentences
 
-// How many of the runs have not finished.
-inline size_t unfinished(const Runs& runs) {
-    return static_cast<size_t>(std::count_if(runs.begin(), runs.end(), [](const Run* run) { return !run->finished; }));
+inline long unfinished(const Runs& runs) {
+    return std::count_if(runs.begin(), runs.end(), [](const Run* run) { return !run->finished; });
 }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
@@ -600,14 +564,13 @@ inline std::string compared(const Runs& runs, Quantity quantity, const PaperResu
 inline std::string verdict(const Group& group) {
     const Run& any = group.any();
     if (!paper_result(any)) return "";
-    std::string out;
-    double interactions = 0;
+    std::string out = group.heading + ", final " + group.unit + ": ";
     for (size_t i = group.by_method.size(); i-- > 0;) {
         const Runs& runs = group.by_method[i];
-        out += out.empty() ? group.heading + ", final " + group.unit + ": " : "; ";
-        out += compared(runs, group.quantity, *paper_result(*runs[0]));
-        for (const Run* run : runs) interactions = std::max(interactions, run->so_far);
+        out += compared(runs, group.quantity, *paper_result(*runs[0])) + (i > 0 ? "; " : "");
     }
+    double interactions = 0;
+    for (const Run* run : group.runs) interactions = std::max(interactions, run->so_far);
     if (interactions > 0)
         out += "; online interactions: up to " + svg::grouped(interactions, 0) + ", paper " +
                (any.mujoco ? "200,000" : "20,000");
@@ -616,53 +579,42 @@ inline std::string verdict(const Group& group) {
     return out + ".";
 }
 
-// A column of mean ± deviation over runs of final_value or last_ten.
-inline Column<Runs> mean_column(const std::string& title, double (*number_of)(const Run&, Quantity),
-                                Quantity quantity) {
-    return {title, [=](const Runs& runs) { return plus_minus(spread_of(runs, number_of, quantity)); }};
-}
-
 // One row for each method: the number of seeds, our results as mean ± deviation over them, and the paper's.
 inline Table method_table(const Group& group) {
-    const auto seeds = [](const Runs& runs) {
-        const size_t open = unfinished(runs);
-        return std::to_string(runs.size()) + (open > 0 ? " (" + std::to_string(open) + " unfinished)" : "");
-    };
-    const auto paper = [](const Runs& runs) { return paper_result(*runs[0]) ? paper_result(*runs[0])->text() : "-"; };
-    std::vector<Column<Runs>> columns{{"Method", [](const Runs& runs) { return runs[0]->about_method().label; }},
-                                      {"Seeds", seeds},
-                                      mean_column(std::string("Final ") + group.unit, final_value, group.quantity),
-                                      mean_column("Mean of last 10", last_ten, group.quantity),
-                                      {"Paper", paper},
-                                      mean_column("Final return", final_value, &Run::total)};
-    if (group.quantity != &Run::length) columns.push_back(mean_column("Final length", final_value, &Run::length));
-    return make_table(group.by_method, columns);
-}
-
-// All runs of a group, by method and seed.
-inline Runs all_runs(const Group& group) {
-    Runs out;
-    for (const Runs& runs : group.by_method) out.insert(out.end(), runs.begin(), runs.end());
-    return out;
+    const bool scores = group.quantity != &Run::length;
+    Table table{{"Method", "Seeds", std::string("Final ") + group.unit, "Mean of last 10", "Paper", "Final return"},
+                {}};
+    if (scores) table.header.push_back("Final length");
+    for (const Runs& runs : group.by_method) {
+        const auto mean = [&](Summary summary, Quantity quantity) {
+            return plus_minus(spread_of(runs, summary, quantity));
+        };
+        std::string seeds = std::to_string(runs.size());
+        if (unfinished(runs) > 0) seeds += " (" + std::to_string(unfinished(runs)) + " unfinished)";
+        const PaperResult* paper = paper_result(*runs[0]);
+        table.rows.push_back({runs[0]->about_method().label, seeds, mean(final_value, group.quantity),
+                              mean(last_ten, group.quantity), paper ? paper->text() : "-",
+                              mean(final_value, &Run::total)});
+        if (scores) table.rows.back().push_back(mean(final_value, &Run::length));
+    }
+    return table;
 }
 
 // One row for each run: how far it came, its own results, and where it lies.
 inline Table run_table(const Group& group) {
-    const auto text = [](double (*number_of)(const Run&, Quantity), Quantity quantity) {
-        return [=](const Run* run) { return svg::grouped(number_of(*run, quantity), 2); };
-    };
-    std::vector<Column<const Run*>> columns{
-        {"Run", [](const Run* run) { return run->name(); }},
-        {"State", [](const Run* run) { return run->finished ? "finished" : "unfinished"; }},
-        {"Interactions", [](const Run* run) { return svg::grouped(run->so_far, 0); }},
-        {std::string("Final ") + group.unit, text(final_value, group.quantity)},
-        {"Last 10", text(last_ten, group.quantity)}};
-    if (!group.any().mujoco) {
-        columns.push_back({"Shortest met", [](const Run* run) { return svg::grouped(shortest_met(*run), 0); }});
-        columns.push_back({"At 5 from", [](const Run* run) { return svg::grouped(kept_from(*run, 5), 0); }});
+    const bool grid = !group.any().mujoco;
+    Table table{{"Run", "State", "Interactions", std::string("Final ") + group.unit, "Last 10"}, {}};
+    if (grid) table.header.insert(table.header.end(), {"Shortest met", "At 5 from"});
+    table.header.push_back("Folder");
+    for (const Run* run : group.runs) {
+        std::vector<std::string>& row = table.rows.emplace_back();
+        row = {run->name(), run->finished ? "finished" : "unfinished", svg::grouped(run->so_far, 0)};
+        for (const Summary summary : {final_value, last_ten})
+            row.push_back(svg::grouped(summary(*run, group.quantity), 2));
+        if (grid) row.insert(row.end(), {svg::grouped(shortest_met(*run), 0), svg::grouped(kept_from(*run, 5), 0)});
+        row.push_back(run->folder);
     }
-    columns.push_back({"Folder", [](const Run* run) { return run->folder; }});
-    return make_table(all_runs(group), columns);
+    return table;
 }
 
 // What the command line set beyond task, method, preset, seed and physics: " --set width=64".
@@ -678,14 +630,15 @@ inline std::string other_options(const Run& run) {
 
 // One row for each run, with the command that repeats it.
 inline Table command_table(const Group& group) {
-    const auto command = [](const Run* run) {
+    Table table{{"To repeat these runs", "Arithmetic"}, {}};
+    for (const Run* run : group.runs) {
         const Settings& s = run->settings;
-        return "wodtem train " + s.task + " --method " + s.method + " --preset " + s.preset + " --seed " +
-               std::to_string(s.seed) + (run->mujoco ? " --physics " + s.physics : "") + other_options(*run);
-    };
-    return make_table<const Run*>(
-        all_runs(group),
-        {{"To repeat these runs", command}, {"Arithmetic", [](const Run* run) { return run->settings.arithmetic; }}});
+        table.rows.push_back({"wodtem train " + s.task + " --method " + s.method + " --preset " + s.preset +
+                                  " --seed " + std::to_string(s.seed) + (run->mujoco ? " --physics " + s.physics : "") +
+                                  other_options(*run),
+                              s.arithmetic});
+    }
+    return table;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -733,21 +686,19 @@ inline void add_mujoco_task(Section& section, const Group& group) {
     }
 }
 
-// Errors: report.mixed if two runs that belong together differ in `what`.
-inline void require_equal(const Run& a, const Run& b, const std::string& in_a, const std::string& in_b) {
-    if (in_a != in_b)
-        fail("report.mixed", "%s was run with \"%s\" and %s with \"%s\"; report them apart", a.folder.c_str(),
-             trimmed(in_a).c_str(), b.folder.c_str(), trimmed(in_b).c_str());
-}
-
 // A section has runs on one version of the library, since versions may differ in every digit; a mean over seeds needs
 // each seed once and nothing else different. Errors: report.mixed, report.same_seed.
 inline void check_comparable(const Runs& runs) {
     for (size_t i = 1; i < runs.size(); ++i) {
         const Run &a = *runs[i - 1], &b = *runs[i];
-        require_equal(a, b, "MuJoCo " + a.settings.mujoco, "MuJoCo " + b.settings.mujoco);
+        const auto require_equal = [&](const std::string& in_a, const std::string& in_b) {
+            if (in_a != in_b)
+                fail("report.mixed", "%s was run with \"%s\" and %s with \"%s\"; report them apart", a.folder.c_str(),
+                     trimmed(in_a).c_str(), b.folder.c_str(), trimmed(in_b).c_str());
+        };
+        require_equal("MuJoCo " + a.settings.mujoco, "MuJoCo " + b.settings.mujoco);
         if (a.method != b.method) continue;
-        require_equal(a, b, other_options(a), other_options(b));
+        require_equal(other_options(a), other_options(b));
         if (a.settings.seed == b.settings.seed)
             fail("report.same_seed", "%s and %s are the same method with the same seed; give only one of them",
                  a.folder.c_str(), b.folder.c_str());
@@ -759,11 +710,9 @@ inline Section make_section(const Runs& runs) {
     check_comparable(runs);
     const Settings& settings = runs.at(0)->settings;
     const bool mujoco = runs[0]->mujoco != nullptr;
-    Group group{{},
-                settings.task + ", preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
+    Group group{runs, settings.task + ", preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
                 settings.task + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
-                mujoco ? &Run::score : &Run::length,
-                mujoco ? "normalised score" : "length"};
+                mujoco ? &Run::score : &Run::length, mujoco ? "normalised score" : "length"};
     for (const Run* run : runs) {
         if (group.by_method.empty() || group.by_method.back()[0]->method != run->method) group.by_method.emplace_back();
         group.by_method.back().push_back(run);
@@ -774,24 +723,24 @@ inline Section make_section(const Runs& runs) {
     return section;
 }
 
-inline const char* how_to_read[] = {
-    "One section for each task, preset and physics. All numbers come from the run folders, except those marked as the "
-    "paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last "
-    "evaluation of a run; last 10: mean over its last ten evaluations; an evaluation that came to nothing (nan in "
-    "progress.csv) is passed over. \"Agrees\": our mean lies within the paper's standard deviation of the paper's mean "
-    "(grid world: WODTEM 5, ODT 6.5 to 7.5).",
-    "Curves: mean over seeds, and a band of one standard deviation to either side; diamonds: the paper's final "
-    "results. Seeds are evaluated at different interactions; each is drawn by its last evaluation until then, and at "
-    "the right end by its final one. DT has no online phase and is a dashed line across. Bars: mean over seeds; "
-    "strokes: one standard deviation to either side. Unfinished runs count as far as they go, so that a curve may jump "
-    "where one of them ends. The file settings in a run's folder has the value of every setting and where it came "
-    "from."};
-
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
     std::map<std::tuple<std::string, std::string, std::string>, Runs> groups;
     for (const Run& run : runs) groups[{run.settings.task, run.settings.preset, run.settings.physics}].push_back(&run);
-    std::vector<Section> sections{{"How to read this", {how_to_read[0], how_to_read[1]}}};
+    const char* const numbers =
+        "One section for each task, preset and physics. All numbers come from the run folders, except those marked as "
+        "the paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last "
+        "evaluation of a run; last 10: mean over its last ten evaluations; an evaluation that came to nothing (nan in "
+        "progress.csv) is passed over. \"Agrees\": our mean lies within the paper's standard deviation of the paper's "
+        "mean (grid world: WODTEM 5, ODT 6.5 to 7.5).";
+    const char* const figures =
+        "Curves: mean over seeds, and a band of one standard deviation to either side; diamonds: the paper's final "
+        "results. Seeds are evaluated at different interactions; each is drawn by its last evaluation until then, and "
+        "at the right end by its final one. DT has no online phase and is a dashed line across. Bars: mean over "
+        "seeds; strokes: one standard deviation to either side. Unfinished runs count as far as they go, so that a "
+        "curve may jump where one of them ends. The file settings in a run's folder has the value of every setting "
+        "and where it came from.";
+    std::vector<Section> sections{{"How to read this", {numbers, figures}}};
     for (const auto& group : groups) sections.push_back(make_section(group.second));
     return sections;
 }
@@ -824,8 +773,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
         }
         if (!section.verdict.empty()) text += markdown(section.verdict);
     }
-    const std::string title =
-        "WODTEM: report on " + std::to_string(runs.size()) + (runs.size() == 1 ? " run" : " runs");
+    const std::string title = "WODTEM: report on " + std::to_string(runs.size()) + (runs.size() > 1 ? " runs" : " run");
     write_file_atomic(out_folder + "/report.html", html_page(title, sections));
     write_file_atomic(out_folder + "/report.md", page(markdown, title, sections));
     return text;

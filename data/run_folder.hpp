@@ -17,13 +17,9 @@
 
 #include <array>
 #include <cerrno>
-#include <cmath>
-#include <cstdint>
 #include <cstdio>
 #include <cstring>
 #include <filesystem>
-#include <string>
-#include <vector>
 
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
@@ -47,8 +43,7 @@ struct Tally {
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
     double dropped = 0;  // episodes whose simulation broke down
 
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("progress.loss", loss);
         archive("progress.entropy", entropy);
         archive("progress.gradient_norm", gradient_norm);
@@ -80,10 +75,12 @@ struct EpisodeRow {
     bool discrete;                 // the actions are moves of the grid world
 };
 
-inline std::string csv_line(const std::vector<std::string>& fields) {
+// A line of a log: the fields as value_text() gives them.
+inline std::string csv_line(const auto&... fields) {
     std::string line;
-    for (const std::string& field : fields) line += (line.empty() ? "" : ",") + field;
-    return line + "\n";
+    ((line += value_text(fields) + ","), ...);
+    line.back() = '\n';
+    return line;
 }
 
 // The last column: which simulation the numbers belong to.
@@ -100,30 +97,15 @@ inline std::string score_text(const Settings& settings, double total_return) {
 inline std::string progress_line(const ProgressRow& row, const Settings& settings) {
     const Tally& t = row.tally;
     const auto mean = [](double sum, double count) {  // to seven digits
-        return count > 0 ? number_text(static_cast<float>(sum / count)) : std::string("nan");
+        return count > 0 ? static_cast<float>(sum / count) : NAN;
     };
     const bool has_entropy = settings.method != "dt";
-    return csv_line({row.online ? "online" : "offline",
-                     std::to_string(row.updates),
-                     std::to_string(row.interactions),
-                     std::to_string(row.episodes),
-                     number_text(row.learning_rate),
-                     mean(t.loss, t.updates),
-                     mean(t.entropy, has_entropy ? t.updates : 0),
-                     has_entropy ? number_text(static_cast<float>(row.lambda)) : "nan",
-                     mean(t.gradient_norm, t.updates),
-                     mean(t.short_pairs, t.pairs),
-                     mean(t.unmatched_pairs, t.pairs),
-                     std::to_string(row.memory_size),
-                     number_text(row.eval_length),
-                     number_text(row.eval_return),
-                     number_text(row.eval_score),
-                     mean(t.rollout_length, t.rollouts),
-                     mean(t.rollout_return, t.rollouts),
-                     number_text(t.matched),
-                     number_text(t.evicted),
-                     number_text(t.dropped),
-                     physics_text(settings)});
+    return csv_line(row.online ? "online" : "offline", row.updates, row.interactions, row.episodes, row.learning_rate,
+                    mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0),
+                    has_entropy ? static_cast<float>(row.lambda) : NAN, mean(t.gradient_norm, t.updates),
+                    mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs), row.memory_size, row.eval_length,
+                    row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
+                    mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped, physics_text(settings));
 }
 
 // The command `eval`: means over the episodes without an error, and on the grid world the first episode's moves.
@@ -164,9 +146,8 @@ inline std::string episode_line(const EpisodeRow& row, const Settings& settings)
     std::string moves;  // a digit each
     if (row.discrete)
         for (const float action : row.trajectory.actions) moves += static_cast<char>('0' + static_cast<int>(action));
-    return csv_line({std::to_string(row.episode), std::to_string(row.interactions),
-                     std::to_string(row.trajectory.length()), number_text(total_return(row.trajectory)),
-                     row.trajectory.terminated ? "1" : "0", moves, physics_text(settings)});
+    return csv_line(row.episode, row.interactions, row.trajectory.length(), total_return(row.trajectory),
+                    row.trajectory.terminated ? "1" : "0", moves, physics_text(settings));
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -187,7 +168,6 @@ struct Log {
         bytes = crc = 0;
         append(header);
     }
-    void sync() const { AppendFile(path).sync(); }
 
     // Errors: run.log, if the file does not begin with what it held at the checkpoint.
     void check() const {
@@ -211,11 +191,10 @@ struct RunFolder {
         episodes.begin(episodes_header);
     }
     void sync_logs() const {
-        progress.sync();
-        episodes.sync();
+        AppendFile(progress.path).sync();
+        AppendFile(episodes.path).sync();
     }
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("progress.progress_bytes", progress.bytes);
         archive("progress.episodes_bytes", episodes.bytes);
         archive("progress.progress_crc", progress.crc);
@@ -265,8 +244,7 @@ inline void claim_folder(const RunFolder& folder, const Settings& settings) {
 inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";
 
 // The logs reach the disk first: the checkpoint notes how long they are.
-template <class Visit>
-void save_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void save_checkpoint(RunFolder& folder, const Settings& settings, auto&& visit) {
     folder.sync_logs();
     TensorFile file;
     file.metadata["format"] = checkpoint_format;
@@ -278,8 +256,7 @@ void save_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit)
 }
 
 // Reads the state alone. Errors name the file: checkpoint.format, run.other_settings, and those of the visited state.
-template <class Visit>
-void load_state(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit) {
     const std::string path = folder.file("checkpoint.safetensors");
     try {
         const TensorFile file = read_safetensors(path);
@@ -295,8 +272,7 @@ void load_state(RunFolder& folder, const Settings& settings, Visit&& visit) {
 }
 
 // Reads the state and cuts the logs back to where they were; if one of them does not fit, neither is touched.
-template <class Visit>
-void load_checkpoint(RunFolder& folder, const Settings& settings, Visit&& visit) {
+inline void load_checkpoint(RunFolder& folder, const Settings& settings, auto&& visit) {
     load_state(folder, settings, visit);
     folder.progress.check();
     folder.episodes.check();
@@ -311,8 +287,7 @@ struct CheckpointTimer {
     double save_seconds = 0;  // of the latest one
 
     bool due() const { return every == 0 || seconds_since(saved) >= std::max(every, 20 * save_seconds); }
-    template <class Save>
-    void time(Save&& save) {
+    void time(auto&& save) {
         const Clock::time_point begin = Clock::now();
         save();
         save_seconds = seconds_since(begin);
@@ -334,9 +309,9 @@ inline void save_policy(const RunFolder& folder, const std::vector<std::vector<f
     for (const GridMove& move : grid_move_table) text += std::string(",") + move.name;
     text += "\n";
     for (int cell = 0; cell < grid_cells; ++cell) {
-        std::vector<std::string> fields = {std::to_string(cell / grid_size), std::to_string(cell % grid_size)};
-        for (const float p : probabilities[cell]) fields.push_back(number_text(p));
-        text += csv_line(fields);
+        text += std::to_string(cell / grid_size) + "," + std::to_string(cell % grid_size);
+        for (const float p : probabilities[cell]) text += "," + number_text(p);
+        text += "\n";
     }
     write_file_atomic(folder.file("policy.csv"), text);
 }
@@ -366,8 +341,7 @@ inline void save_start_actions(const RunFolder& folder, const std::vector<float>
                                const std::vector<double>& offline, const std::vector<double>& online) {
     std::string text = "move,learned,offline,online\n";
     for (int move = 0; move < grid_moves; ++move)
-        text += csv_line({grid_move_table[move].name, number_text(learned[move]), number_text(offline[move]),
-                          online.empty() ? "nan" : number_text(online[move])});
+        text += csv_line(grid_move_table[move].name, learned[move], offline[move], online.empty() ? NAN : online[move]);
     write_file_atomic(folder.file("start_actions.csv"), text);
 }
 
@@ -382,8 +356,7 @@ inline void save_paths(const RunFolder& folder, const std::vector<Episode>& epis
         const size_t length = episode.trajectory.rewards.size(), state_dim = episode.state.size();
         for (size_t t = 0; t <= length; ++t) {
             const float* state = t < length ? &episode.trajectory.states[t * state_dim] : episode.state.data();
-            text += csv_line({std::to_string(number), std::to_string(t), number_text(goals[i][0]),
-                              number_text(goals[i][1]), number_text(state[0]), number_text(state[1])});
+            text += csv_line(number, t, goals[i][0], goals[i][1], state[0], state[1]);
         }
         ++number;
     }

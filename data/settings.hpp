@@ -8,6 +8,7 @@
 //
 // Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
 // an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
+// The other headers of data/ that include this one have what it includes.
 #pragma once
 
 #include <algorithm>
@@ -17,11 +18,10 @@
 #include <map>
 #include <memory>
 #include <optional>
-#include <set>
+#include <ranges>
 #include <span>
 #include <string>
 #include <string_view>
-#include <utility>
 #include <variant>
 #include <vector>
 
@@ -34,13 +34,8 @@
 
 // The parts of a text between separators; "" is one empty part.
 inline std::vector<std::string> split(const std::string& text, char separator) {
-    std::vector<std::string> parts(1);
-    for (const char c : text) {
-        if (c == separator)
-            parts.emplace_back();
-        else
-            parts.back() += c;
-    }
+    std::vector<std::string> parts(text.empty() ? 1 : 0);
+    for (const auto part : std::views::split(text, separator)) parts.emplace_back(part.begin(), part.end());
     return parts;
 }
 
@@ -50,11 +45,21 @@ inline std::string trimmed(std::string_view text) {
     return std::string(text.substr(first, text.find_last_not_of(" \t") + 1 - first));
 }
 
-// The shortest text that reads back as the same number; Number is float or double.
-template <class Number>
-std::string number_text(Number x) {
+// The shortest text that reads back as the same number, of whatever type it is.
+inline std::string number_text(auto x) {
     char text[32];
     return {text, std::to_chars(text, text + sizeof text, x).ptr};
+}
+
+// A text as it is; yes or no; or number_text().
+template <class Value>
+std::string value_text(const Value& value) {
+    if constexpr (std::is_same_v<Value, bool>)
+        return value ? "yes" : "no";
+    else if constexpr (std::is_arithmetic_v<Value>)
+        return number_text(value);
+    else
+        return value;
 }
 
 // A finite number that takes up the whole text, or nothing.
@@ -85,6 +90,17 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
     return *std::min_element(names.begin(), names.end(), [&](const std::string& a, const std::string& b) {
         return edit_distance(name, a) < edit_distance(name, b);
     });
+}
+
+// The row of a table that has this name. `sentence` is a format of two texts: the name, and the nearest one.
+// Errors: `id`, if there is none.
+inline const auto& row_named(const auto& rows, const std::string& name, const char* id, const std::string& sentence) {
+    std::vector<std::string> names;
+    for (const auto& row : rows) {
+        if (name == row.name) return row;
+        names.push_back(row.name);
+    }
+    fail(id, sentence.c_str(), name.c_str(), nearest_name(name, names).c_str());
 }
 
 // The index of `name` among an enumeration's names, which hold it.
@@ -213,114 +229,72 @@ inline const SettingRow setting_rows[] = {
 };
 
 // What the D4RL tasks change; later rows override earlier ones. A row holds for tasks whose name begins with `task` and
-// for `method`; "" stands for all. ODT's paper prints no such table: values marked "unverified" have no source, values
-// marked "one public reproduction" a single one.
+// for `method`; "" stands for all. `values`: NAME=VALUE, separated by blanks. ODT's paper prints no such table: values
+// marked "unverified" have no source, values marked "one public reproduction" a single one.
 struct TaskRow {
-    const char *task, *method, *name, *value, *source;
+    const char *task, *method, *values, *source;
 };
 // WODTEM Table II: each row likewise.
 inline const TaskRow task_rows[] = {
-    {"", "", "layers", "4", "ODT's code"},
-    {"", "", "heads", "4", "ODT's code"},
-    {"", "", "width", "512", "ODT's code"},
-    {"", "", "context_length", "20", "ODT's code"},
-    {"", "", "updates_per_iteration", "300", "ODT's code"},
-    {"", "", "buffer_size", "1000", "ODT's code"},
-    {"", "", "eval_episodes", "10", "ODT's code"},
-    {"", "", "reward_scale", "0.001", "ODT's code"},
-    {"", "", "learning_rate", "1e-4", "ODT's code"},
-    {"", "", "weight_decay", "5e-4", "ODT's code"},
-    {"", "", "offline_updates", "5000", "ODT's code"},
-    {"", "", "position", "no", "ODT's code"},
-    {"", "", "gamma", "0.99", "WODTEM sec. V-C"},
-    {"", "", "epsilon", "0.1", "WODTEM sec. V-C"},
-    {"", "", "online_steps", "200000", "WODTEM sec. V-C"},
-    {"", "", "projected_dim", "4", "WODTEM sec. V-C"},
-    {"", "", "table_size", "2e6", "WODTEM sec. V-C"},
-    {"", "", "alpha", "0.9", "WODTEM sec. V-C"},
-    {"", "", "K", "2", "WODTEM sec. V-C"},
-    {"", "", "physics", "d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
-    {"", "", "behaviour", "recorded", "the data set"},
-    {"", "", "data_trajectories", "10", "chosen, of random actions: enough to normalise states by"},
-    {"", "", "data_seed", "0", "chosen"},
-    {"hopper", "", "g_eval", "3600", "ODT's code"},
-    {"hopper", "", "g_online", "7200", "ODT's code"},
-    {"hopper", "", "eta", "-3", "ODT's code: minus the action dimensions"},
-    {"hopper-medium-replay", "", "learning_rate", "2e-3", "one public reproduction of ODT"},
-    {"hopper-medium-replay", "", "weight_decay", "1e-4", "one public reproduction of ODT"},
-    {"walker2d", "", "learning_rate", "1e-3", "public reproductions of ODT agree"},
-    {"walker2d", "", "weight_decay", "1e-3", "public reproductions of ODT agree"},
-    {"walker2d", "", "offline_updates", "10000", "public reproductions of ODT agree"},
-    {"walker2d", "", "g_eval", "5000", "public reproductions of ODT agree"},
-    {"walker2d", "", "g_online", "10000", "public reproductions of ODT agree"},
-    {"walker2d", "", "eta", "-6", "ODT's code: minus the action dimensions"},
-    {"walker2d", "", "epsilon", "0.2", "WODTEM sec. V-C"},
-    {"halfcheetah", "", "g_eval", "6000", "public reproductions of ODT agree"},
-    {"halfcheetah", "", "g_online", "12000", "public reproductions of ODT agree"},
-    {"halfcheetah", "", "eta", "-6", "ODT's code: minus the action dimensions"},
-    {"halfcheetah", "", "epsilon", "0.6", "WODTEM sec. V-C"},
-    {"ant-", "", "g_eval", "6000", "unverified"},
-    {"ant-", "", "g_online", "12000", "unverified"},
-    {"ant", "", "eta", "-8", "ODT's code: minus the action dimensions"},
-    {"ant", "", "epsilon", "0.3", "WODTEM sec. V-C"},
-    {"antmaze", "", "width", "1024", "one public reproduction of ODT"},
-    {"antmaze", "", "learning_rate", "1e-3", "one public reproduction of ODT"},
-    {"antmaze", "", "weight_decay", "0", "one public reproduction of ODT"},
-    {"antmaze", "", "offline_updates", "7000", "one public reproduction of ODT"},
-    {"antmaze", "", "buffer_size", "1500", "one public reproduction of ODT"},
-    {"antmaze", "", "position", "yes", "one public reproduction of ODT"},
-    {"antmaze", "", "g_eval", "1", "one public reproduction of ODT"},
-    {"antmaze", "", "g_online", "2", "one public reproduction of ODT"},
-    {"antmaze", "", "reward_scale", "1", "ODT's code"},
-    {"maze2d", "", "layers", "4", "WODTEM Table II: number of layers"},
-    {"maze2d", "", "heads", "4", "WODTEM Table II: number of attention heads"},
-    {"maze2d", "", "width", "512", "WODTEM Table II: embedding dimension"},
-    {"maze2d", "", "context_length", "20", "WODTEM Table II: context length"},
-    {"maze2d", "", "learning_rate", "1e-3", "WODTEM Table II: learning rate"},
-    {"maze2d", "", "weight_decay", "0", "WODTEM Table II: weight decay"},
-    {"maze2d", "", "offline_updates", "20000", "WODTEM Table II: offline training updates"},
-    {"maze2d", "", "updates_per_iteration", "300", "WODTEM Table II: online training updates per iteration"},
-    {"maze2d", "", "buffer_size", "1500", "WODTEM Table II: buffer size"},
-    {"maze2d", "", "position", "yes", "WODTEM Table II: position"},
-    {"maze2d", "", "eta", "-2", "ODT's code: minus the action dimensions"},
-    {"maze2d-umaze", "", "g_online", "340", "WODTEM Table II: g_online"},
-    {"maze2d-umaze", "", "g_eval", "170", "WODTEM Table II: g_eval"},
-    {"maze2d-medium", "", "g_online", "560", "WODTEM Table II: g_online"},
-    {"maze2d-medium", "", "g_eval", "280", "WODTEM Table II: g_eval"},
-    {"maze2d-large", "", "g_online", "560", "WODTEM Table II: g_online"},
-    {"maze2d-large", "", "g_eval", "280", "WODTEM Table II: g_eval"},
-    {"maze2d-large", "", "table_size", "4e6", "WODTEM sec. V-C"},
-    {"", "dt", "layers", "3", "DT's code"},
-    {"", "dt", "heads", "1", "DT's code"},
-    {"", "dt", "width", "128", "DT's code"},
-    {"", "dt", "eval_context", "20", "DT's code"},
-    {"", "dt", "batch_size", "64", "DT's code"},
-    {"", "dt", "optimizer", "adamw", "DT's code"},
-    {"", "dt", "learning_rate", "1e-4", "DT's code"},
-    {"", "dt", "weight_decay", "1e-4", "DT's code"},
-    {"", "dt", "offline_updates", "100000", "DT's code"},
-    {"", "dt", "position", "yes", "DT's code"},
-    {"maze2d", "dt", "reward_scale", "1", "chosen: as others' DT on maze2d"},
+    {"", "",
+     "layers=4 heads=4 width=512 context_length=20 position=no learning_rate=1e-4 weight_decay=5e-4 "
+     "offline_updates=5000 updates_per_iteration=300 buffer_size=1000 eval_episodes=10 reward_scale=0.001",
+     "ODT's code"},
+    {"", "", "online_steps=200000 gamma=0.99 epsilon=0.1 projected_dim=4 table_size=2e6 alpha=0.9 K=2",
+     "WODTEM sec. V-C"},
+    {"", "", "physics=d4rl", "chosen: as MuJoCo up to 2.1.0, which made D4RL's data"},
+    {"", "", "behaviour=recorded", "the data set"},
+    {"", "", "data_trajectories=10", "chosen, of random actions: enough to normalise states by"},
+    {"", "", "data_seed=0", "chosen"},
+    {"hopper", "", "g_eval=3600 g_online=7200", "ODT's code"},
+    {"hopper-medium-replay", "", "learning_rate=2e-3 weight_decay=1e-4", "one public reproduction of ODT"},
+    {"walker2d", "", "learning_rate=1e-3 weight_decay=1e-3 offline_updates=10000 g_eval=5000 g_online=10000",
+     "public reproductions of ODT agree"},
+    {"walker2d", "", "epsilon=0.2", "WODTEM sec. V-C"},
+    {"halfcheetah", "", "g_eval=6000 g_online=12000", "public reproductions of ODT agree"},
+    {"halfcheetah", "", "epsilon=0.6", "WODTEM sec. V-C"},
+    {"ant-", "", "g_eval=6000 g_online=12000", "unverified"},
+    {"ant", "", "epsilon=0.3", "WODTEM sec. V-C"},
+    {"antmaze", "",
+     "width=1024 position=yes learning_rate=1e-3 weight_decay=0 offline_updates=7000 buffer_size=1500 g_eval=1 "
+     "g_online=2",
+     "one public reproduction of ODT"},
+    {"antmaze", "", "reward_scale=1", "ODT's code"},
+    {"maze2d", "", "layers=4", "WODTEM Table II: number of layers"},
+    {"maze2d", "", "heads=4", "WODTEM Table II: number of attention heads"},
+    {"maze2d", "", "width=512", "WODTEM Table II: embedding dimension"},
+    {"maze2d", "", "context_length=20", "WODTEM Table II: context length"},
+    {"maze2d", "", "learning_rate=1e-3", "WODTEM Table II: learning rate"},
+    {"maze2d", "", "weight_decay=0", "WODTEM Table II: weight decay"},
+    {"maze2d", "", "offline_updates=20000", "WODTEM Table II: offline training updates"},
+    {"maze2d", "", "updates_per_iteration=300", "WODTEM Table II: online training updates per iteration"},
+    {"maze2d", "", "buffer_size=1500", "WODTEM Table II: buffer size"},
+    {"maze2d", "", "position=yes", "WODTEM Table II: position"},
+    {"maze2d", "", "g_online=560", "WODTEM Table II: g_online"},
+    {"maze2d", "", "g_eval=280", "WODTEM Table II: g_eval"},
+    {"maze2d-umaze", "", "g_online=340", "WODTEM Table II: g_online"},
+    {"maze2d-umaze", "", "g_eval=170", "WODTEM Table II: g_eval"},
+    {"maze2d-large", "", "table_size=4e6", "WODTEM sec. V-C"},
+    {"", "dt",
+     "layers=3 heads=1 width=128 eval_context=20 position=yes optimizer=adamw learning_rate=1e-4 weight_decay=1e-4 "
+     "batch_size=64 offline_updates=100000",
+     "DT's code"},
+    {"maze2d", "dt", "reward_scale=1", "chosen: as others' DT on maze2d"},
 };
 
 // Preset small: what it changes of preset paper, so that a run takes half an hour on two cores. All three methods share
 // one network and one schedule, so that only the objective differs.
 inline const TaskRow small_rows[] = {
-    {"", "", "layers", "2", "preset small"},
-    {"", "", "heads", "2", "preset small"},
-    {"", "", "width", "64", "preset small"},
-    {"", "", "context_length", "1", "preset small: states tell all; more windows instead of longer ones"},
-    {"", "", "batch_size", "256", "preset small: ODT's"},
-    {"", "", "position", "no",
-     "preset small: maze2d's data end after 230 steps; later rows of the table would not learn"},
-    {"", "", "learning_rate", "1e-3", "preset small: a narrow network and few updates"},
-    {"", "", "warmup_updates", "1000", "preset small: a tenth of ODT's"},
-    {"", "", "offline_updates", "6000", "preset small"},
-    {"", "dt", "offline_updates", "12700", "preset small: as many as the others make, where episodes have 300 steps"},
-    {"", "", "updates_per_iteration", "100", "preset small"},
-    {"", "", "online_steps", "20000", "preset small: a tenth of WODTEM's"},
-    {"maze2d", "", "reward_scale", "1", "preset small: at ODT's 0.001 returns-to-go, at most 0.055, are not heeded"},
-    {"maze2d", "", "buffer_size", "4000", "preset small: the best 1500 trajectories all leave the goal"},
+    {"", "", "layers=2 heads=2 width=64 offline_updates=6000 updates_per_iteration=100", "preset small"},
+    {"", "", "context_length=1", "preset small: states tell all; more windows instead of longer ones"},
+    {"", "", "batch_size=256", "preset small: ODT's"},
+    {"", "", "position=no", "preset small: maze2d's data end after 230 steps; later rows of the table would not learn"},
+    {"", "", "learning_rate=1e-3", "preset small: a narrow network and few updates"},
+    {"", "", "warmup_updates=1000", "preset small: a tenth of ODT's"},
+    {"", "dt", "offline_updates=12700", "preset small: as many as the others make, where episodes have 300 steps"},
+    {"", "", "online_steps=20000", "preset small: a tenth of WODTEM's"},
+    {"maze2d", "", "reward_scale=1", "preset small: at ODT's 0.001 returns-to-go, at most 0.055, are not heeded"},
+    {"maze2d", "", "buffer_size=4000", "preset small: the best 1500 trajectories all leave the goal"},
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -328,60 +302,44 @@ inline const TaskRow small_rows[] = {
 
 // Errors: usage.setting names the nearest setting.
 inline const SettingRow& setting_row(const std::string& name) {
-    std::vector<std::string> names;
-    for (const SettingRow& row : setting_rows) {
-        if (name == row.name) return row;
-        names.push_back(row.name);
-    }
-    fail("usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"", name.c_str(),
-         nearest_name(name, names).c_str());
+    return row_named(setting_rows, name, "usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"");
 }
 
 inline std::string setting_text(const Settings& settings, const SettingRow& row) {
-    const auto text = [&](auto field) -> std::string {
-        const auto& value = settings.*field;
-        using Value = std::decay_t<decltype(value)>;
-        if constexpr (std::is_same_v<Value, bool>) return value ? "yes" : "no";
-        if constexpr (std::is_same_v<Value, int64_t>) return std::to_string(value);
-        if constexpr (std::is_same_v<Value, double>) return number_text(value);
-        if constexpr (std::is_same_v<Value, std::string>) return value;
-    };
-    return std::visit(text, row.field);
+    return std::visit([&](auto field) { return value_text(settings.*field); }, row.field);
 }
 
-inline std::string parse_choice(const SettingRow& row, const std::string& text) {
+// A value's text is checked by its type: a word against the choices of its row, a number against its range. Errors of
+// the three functions: usage.setting with what is allowed.
+inline void parse_value(const SettingRow& row, const std::string& text, std::string& value) {
     const std::vector<std::string> choices = split(row.choices, '|');
     if (*row.choices != 0 && std::find(choices.begin(), choices.end(), text) == choices.end())
         fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
              row.choices, nearest_name(text, choices).c_str());
-    return text;
+    value = text;
 }
 
-inline bool parse_flag(const SettingRow& row, const std::string& text) {
+inline void parse_value(const SettingRow& row, const std::string& text, bool& value) {
     if (text != "yes" && text != "no")
         fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
-    return text == "yes";
+    value = text == "yes";
 }
 
-inline double parse_number(const SettingRow& row, const std::string& text, bool whole) {
+template <class Number>
+void parse_value(const SettingRow& row, const std::string& text, Number& value) {
+    constexpr bool whole = std::is_integral_v<Number>;
     const std::optional<double> x = to_number(text);
-    if (x && *x >= row.low && *x <= row.high && (!whole || *x == std::floor(*x))) return *x;
     const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
-    fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
-         text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
-         number_text(whole ? std::round(nearest) : nearest).c_str());
+    if (x != nearest || (whole && *x != std::floor(*x)))
+        fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
+             text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
+             number_text(whole ? std::round(nearest) : nearest).c_str());
+    value = static_cast<Number>(*x);
 }
 
-// Errors: usage.setting with what is allowed.
 inline void set_setting(Settings& settings, const std::string& name, const std::string& text) {
     const SettingRow& row = setting_row(name);
-    if (const auto* word = std::get_if<std::string Settings::*>(&row.field))
-        settings.*(*word) = parse_choice(row, text);
-    if (const auto* flag = std::get_if<bool Settings::*>(&row.field)) settings.*(*flag) = parse_flag(row, text);
-    if (const auto* real = std::get_if<double Settings::*>(&row.field))
-        settings.*(*real) = parse_number(row, text, false);
-    if (const auto* integer = std::get_if<int64_t Settings::*>(&row.field))
-        settings.*(*integer) = static_cast<int64_t>(parse_number(row, text, true));
+    std::visit([&](auto field) { parse_value(row, text, settings.*field); }, row.field);
 }
 
 // `source`: the command line, the preset, the method or a row of `task_rows`.
@@ -407,9 +365,13 @@ inline Settings default_settings(const std::string& task, const std::string& met
     const auto apply = [&](std::span<const TaskRow> rows) {
         for (const TaskRow& row : rows)
             if (!gridworld && settings.task.starts_with(row.task) && (*row.method == 0 || method == row.method))
-                set_from(settings, row.name, row.value, row.source);
+                for (const std::string& assignment : split(row.values, ' '))
+                    set_from(settings, assignment.substr(0, assignment.find('=')),
+                             assignment.substr(assignment.find('=') + 1), row.source);
     };
     apply(task_rows);
+    if (const MujocoTask* mujoco = find_mujoco_task(settings.task))
+        set_from(settings, "eta", std::to_string(-mujoco->action_dim), "ODT's code: minus the action dimensions");
     if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (preset == "small") apply(small_rows);
     if (method == "dt") {
@@ -424,16 +386,16 @@ inline Settings default_settings(const std::string& task, const std::string& met
 
 // Conditions on several settings at once. Errors: usage.setting.
 inline void check_together(const Settings& settings) {
-    const long long width = settings.width, heads = settings.heads;
+    const long long width = settings.width, heads = settings.heads, batch_size = settings.batch_size;
+    const long long context_length = settings.context_length, online_steps = settings.online_steps;
     if (width % heads != 0)
         fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", width, heads,
              (width / heads + 1) * heads);
-    if (settings.batch_size * settings.context_length > 1000000)
+    if (batch_size * context_length > 1000000)
         fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
-             static_cast<long long>(settings.batch_size), static_cast<long long>(settings.context_length));
-    if (settings.online_steps > 0 && settings.method == "dt")
-        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld",
-             static_cast<long long>(settings.online_steps));
+             batch_size, context_length);
+    if (online_steps > 0 && settings.method == "dt")
+        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
     const bool gridworld = settings.task == "gridworld";
     if (gridworld != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
@@ -465,15 +427,15 @@ struct Setting {
 // The lines of a text form, before they are checked against the table. Blank lines and lines that begin with # are
 // skipped; the first " = " of a line ends the name, the first " # " after it ends the value. Errors: settings.line,
 // settings.repeated.
-inline std::vector<Setting> parse_settings(std::string_view text, const std::string& path) {
+inline std::vector<Setting> parse_settings(const std::string& text, const std::string& path) {
     std::vector<Setting> out;
-    for (size_t line = 1; !text.empty(); ++line) {
-        const std::string_view all = text.substr(0, text.find('\n'));
-        text.remove_prefix(std::min(text.size(), all.size() + 1));
+    size_t line = 0;
+    for (const std::string& all : split(text, '\n')) {
+        ++line;
         if (trimmed(all).empty() || trimmed(all)[0] == '#') continue;
         const size_t equals = all.find(" = "), hash = all.find(" # ", equals);  // npos stays npos
         Setting setting;
-        if (hash != std::string_view::npos)
+        if (hash != std::string::npos)
             setting = {trimmed(all.substr(0, equals)), trimmed(all.substr(equals + 2, hash - equals - 2)),
                        trimmed(all.substr(hash + 2))};
         if (setting.name.empty() || setting.value.empty() || setting.source.empty())
@@ -490,17 +452,15 @@ inline std::vector<Setting> parse_settings(std::string_view text, const std::str
 // `path` is named in errors: settings.value, settings.missing, and those of parse_settings().
 inline Settings settings_from_text(const std::string& text, const std::string& path) {
     Settings settings;
-    std::set<std::string> found;
     for (const auto& [name, value, source] : parse_settings(text, path)) {
         try {
             set_from(settings, name, value, source);
         } catch (const Error& error) {
             fail("settings.value", "%s: %s; is it damaged, or from another version?", path.c_str(), error.what());
         }
-        found.insert(name);
     }
     for (const SettingRow& row : setting_rows)
-        if (!found.contains(row.name))
+        if (!settings.source.contains(row.name))
             fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
                  row.name);
     return settings;
@@ -524,43 +484,37 @@ inline void require_same_settings(const Settings& found, const Settings& wanted,
 
 inline TransformerConfig transformer_config(const Settings& settings, const EnvironmentSpec& spec) {
     const bool discrete = spec.discrete_actions > 0;
-    TransformerConfig config;
-    config.state_dim = spec.state_dim;
-    config.action_dim = discrete ? spec.discrete_actions : spec.action_dim;  // a discrete action is a one-hot vector
-    config.layers = static_cast<int>(settings.layers);
-    config.heads = static_cast<int>(settings.heads);
-    config.width = static_cast<int>(settings.width);
-    config.max_timesteps = settings.position ? 1000 : 0;  // ODT's code: a table of 1000 rows
-    config.dropout = static_cast<float>(settings.dropout);
-    config.head = discrete                  ? Head::categorical
-                  : settings.method == "dt" ? Head::deterministic
-                                            : Head::squashed_gaussian;
-    return config;
+    const Head continuous_head = settings.method == "dt" ? Head::deterministic : Head::squashed_gaussian;
+    return {.state_dim = spec.state_dim,
+            .action_dim = discrete ? spec.discrete_actions : spec.action_dim,  // a discrete action is a one-hot vector
+            .layers = static_cast<int>(settings.layers),
+            .heads = static_cast<int>(settings.heads),
+            .width = static_cast<int>(settings.width),
+            .max_timesteps = settings.position ? 1000 : 0,  // ODT's code: a table of 1000 rows
+            .dropout = static_cast<float>(settings.dropout),
+            .head = discrete ? Head::categorical : continuous_head};
 }
 
 inline OptimizerConfig optimizer_config(const Settings& settings) {
-    OptimizerConfig config;
-    config.rule = settings.optimizer == "lamb" ? OptimizerConfig::Rule::lamb : OptimizerConfig::Rule::adamw;
-    config.learning_rate = settings.learning_rate;
-    config.weight_decay = settings.weight_decay;
-    config.always_adapt = settings.lamb_always_adapt;
-    config.clip_norm = settings.clip_norm;
-    config.warmup_updates = static_cast<uint64_t>(settings.warmup_updates);
-    return config;
+    using Rule = OptimizerConfig::Rule;
+    return {.rule = settings.optimizer == "lamb" ? Rule::lamb : Rule::adamw,
+            .learning_rate = settings.learning_rate,
+            .weight_decay = settings.weight_decay,
+            .always_adapt = settings.lamb_always_adapt,
+            .clip_norm = settings.clip_norm,
+            .warmup_updates = static_cast<uint64_t>(settings.warmup_updates)};
 }
 
 inline MemoryConfig memory_config(const Settings& settings, const EnvironmentSpec& spec) {
-    MemoryConfig config{};
-    config.state_dim = spec.state_dim;
-    config.action_dim = spec.action_dim;
-    config.projected_dim = static_cast<int>(settings.projected_dim);
-    config.capacity = static_cast<size_t>(settings.table_size);
-    config.K = static_cast<int>(settings.K);
-    config.epsilon = settings.epsilon;
-    config.tau = settings.tau;
-    config.exclude_self = settings.exclude_self;
-    config.eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru;
-    return config;
+    return {.state_dim = spec.state_dim,
+            .action_dim = spec.action_dim,
+            .projected_dim = static_cast<int>(settings.projected_dim),
+            .capacity = static_cast<size_t>(settings.table_size),
+            .K = static_cast<int>(settings.K),
+            .epsilon = settings.epsilon,
+            .tau = settings.tau,
+            .exclude_self = settings.exclude_self,
+            .eviction = settings.eviction == "lfu" ? Eviction::lfu : Eviction::lru};
 }
 
 inline GridWorld make_grid_world(const Settings& settings) {

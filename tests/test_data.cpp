@@ -361,7 +361,7 @@ size_t count(const std::string& text, const std::string& part) {
     return found;
 }
 
-constexpr double not_measured = std::numeric_limits<double>::quiet_NaN();
+constexpr double not_measured = NAN;
 
 }  // namespace
 
@@ -371,15 +371,15 @@ TEST(ticks_are_round_and_cover_the_data) {
         for (const svg::Tick& tick : axis.ticks) out += tick.label + " ";
         return out;
     };
-    CHECK_EQUAL(labels(svg::linear_axis(3, 47, 5)), "0 10 20 30 40 50 ");
-    CHECK_EQUAL(labels(svg::linear_axis(-0.25, 0.25, 5)), "\u22120.3 \u22120.2 \u22120.1 0.0 0.1 0.2 0.3 ");
-    CHECK_EQUAL(labels(svg::linear_axis(0, 20000, 5)), "0 5,000 10,000 15,000 20,000 ");
-    CHECK_EQUAL(labels(svg::linear_axis(0, 1, 5)), "0.0 0.2 0.4 0.6 0.8 1.0 ");
-    CHECK_EQUAL(labels(svg::linear_axis(94, 97, 5)), "94.0 94.5 95.0 95.5 96.0 96.5 97.0 ");
+    CHECK_EQUAL(labels(svg::linear_axis(3, 47, 5, 0, 1)), "0 10 20 30 40 50 ");
+    CHECK_EQUAL(labels(svg::linear_axis(-0.25, 0.25, 5, 0, 1)), "\u22120.3 \u22120.2 \u22120.1 0.0 0.1 0.2 0.3 ");
+    CHECK_EQUAL(labels(svg::linear_axis(0, 20000, 5, 0, 1)), "0 5,000 10,000 15,000 20,000 ");
+    CHECK_EQUAL(labels(svg::linear_axis(0, 1, 5, 0, 1)), "0.0 0.2 0.4 0.6 0.8 1.0 ");
+    CHECK_EQUAL(labels(svg::linear_axis(94, 97, 5, 0, 1)), "94.0 94.5 95.0 95.5 96.0 96.5 97.0 ");
     // Hostile ranges: nothing, zero, denormal, one value, two that differ in the last bit.
     for (const auto& [low, high] :
          {std::pair(1.0, 0.0), {0.0, 0.0}, {1e-310, 1e-310}, {-3.0, -3.0}, {1e15, 1e15 + 0.125}, {-2e15, 2e15}}) {
-        const svg::Axis axis = svg::linear_axis(low, high, 5);
+        const svg::Axis axis = svg::linear_axis(low, high, 5, 0, 1);
         CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14 &&
               (low > high || (axis.low <= low && axis.high >= high)));
     }
@@ -387,7 +387,7 @@ TEST(ticks_are_round_and_cover_the_data) {
     for (uint32_t i = 0; i < 2000; ++i) {
         const double scale = std::pow(10.0, 20 * random.uniform(i, 0) - 10);
         const double x = scale * (random.uniform(i, 1) - 0.5), y = x + scale * (i % 3 == 0 ? 0 : random.uniform(i, 2));
-        const svg::Axis axis = svg::linear_axis(x, y, 5);
+        const svg::Axis axis = svg::linear_axis(x, y, 5, 0, 1);
         const double slack = 1e-9 * (axis.high - axis.low);
         CHECK(axis.ticks.size() >= 2 && axis.ticks.size() <= 14);
         CHECK(axis.low <= x + slack && axis.high >= y - slack);
@@ -464,8 +464,13 @@ TEST(legend_begins_a_new_row_before_the_edge) {
 }
 
 TEST(map_draws_one_arrow_per_action_on_filled_cells) {
-    svg::CellMap map{"p", 2, 3, "#B9DAEF", {{0, 0}, {0, 1}, {1, 2}}, {}, {{{1, 2}, "G", svg::green}}, {}, {}, {}};
-    map.arrows = {{{0, 0}, 0, 1, 1}, {{0, 1}, 1, 1, 0.5}, {{0, 2}, 1, 0, 0.25}, {{1, 0}, -1, 0, 0}};
+    svg::CellMap map{"p", 2, 3};
+    for (const svg::Place cell : {svg::Place{0, 0}, {0, 1}, {1, 2}}) map.fill_cell(cell, "#B9DAEF");
+    map.add_letter({1, 2}, "G", svg::green);
+    map.add_arrow({0, 0}, 0, 1, 1);
+    map.add_arrow({0, 1}, 1, 1, 0.5);
+    map.add_arrow({0, 2}, 1, 0, 0.25);
+    map.add_arrow({1, 0}, -1, 0, 0);
     const std::string svg = svg::draw_map(map);  // cells of 200, the first at (48, 76)
     check_figure(svg);
     CHECK_EQUAL(count(svg, "<g opacity"), size_t{4});
@@ -477,9 +482,12 @@ TEST(map_draws_one_arrow_per_action_on_filled_cells) {
 
 TEST(map_draws_paths_with_their_ends_and_circles) {
     // Three rows and four columns: cells of 150, the first at (48, 76).
-    svg::CellMap map{
-        "m <1>", 3, 4, "#C8C8C8", {{2, 2}}, {}, {}, {{{1, 2}, 0.5, svg::ink}}, {}, {{"", "goal & radius"}}};
-    map.paths = {{{{1, 1}, {1, 1.5}, {1, 2}}, svg::blue}, {{{2, 1}, {1, 1}}, svg::green}};
+    svg::CellMap map{"m <1>", 3, 4};
+    map.keys = {{"", "goal & radius"}};
+    map.add_path({{1, 1}, {1, 1.5}, {1, 2}}, svg::blue);
+    map.add_path({{2, 1}, {1, 1}}, svg::green);
+    map.add_circle({1, 2}, 0.5, svg::ink);
+    map.fill_cell({2, 2}, "#C8C8C8");
     const std::string svg = svg::draw_map(map);
     check_figure(svg);
     CHECK_EQUAL(count(svg, "#C8C8C8"), size_t{1});
@@ -491,7 +499,11 @@ TEST(map_draws_paths_with_their_ends_and_circles) {
     CHECK_EQUAL(count(svg, "stroke-width=\"3\""), size_t{2 * 2});  // ends are crosses
     CHECK_EQUAL(count(svg, "goal &amp; radius"), size_t{1});
     CHECK_EQUAL(svg::draw_map(map), svg);
-    map.paths = {{{{-1e12, 1}, {1, 1}, {1e12, 9}}, svg::blue}};  // far off: on the edge
+    // Layers, whatever the order of the calls: cells, lines between them, circles, paths, ends.
+    const size_t cell = svg.find("#C8C8C8"), lines = svg.find("#B0B0B0"), circle = svg.find("r=\"75\"");
+    CHECK(cell < lines && svg.rfind("#B0B0B0") < circle && circle < svg.find("stroke-opacity"));
+    CHECK(svg.rfind("stroke-opacity") < svg.find("r=\"5\""));
+    map.add_path({{-1e12, 1}, {1, 1}, {1e12, 9}}, svg::blue);  // far off: on the edge
     CHECK_EQUAL(count(svg::draw_map(map), "d=\"M 273 76 273 301 648 526 \""), size_t{1});
 }
 
@@ -509,11 +521,4 @@ TEST(pages_are_one_well_formed_file_and_aligned_markdown) {
                 "# A & B\n\nas in the paper\n\n## h\n\np < q\n\n"
                 "| method |  a\\|b |\n| ------ | ----: |\n| <ODT>  |     7 |\n| \u00b1      | 1,000 |\n\n"
                 "![](t.svg)\n\nc\n\n");
-}
-
-TEST(table_has_a_cell_for_each_column_of_each_row) {
-    const Table table = make_table<int>({1, 2}, {{"n", [](int n) { return std::to_string(n); }},
-                                                 {"n * n", [](int n) { return std::to_string(n * n); }}});
-    CHECK(table.header == (std::vector<std::string>{"n", "n * n"}));
-    CHECK(table.rows == (std::vector<std::vector<std::string>>{{"1", "1"}, {"2", "4"}}));
 }

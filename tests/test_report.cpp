@@ -170,10 +170,10 @@ TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
 
 TEST(resampling_takes_the_last_evaluation_at_or_before_each_point) {
     const Run run = run_with({0, 240, 250, 600, 760, 1010}, {50, 40, 30, 20, none, 10}, true);
-    CHECK(equal(curve_points({Runs{&run}}), {0, 250, 500, 750, 1000}));
+    CHECK(equal(curve_points({&run}), {0, 250, 500, 750, 1000}));
     const Run offline = run_with({0}, {50}, true), long_one = run_with({200000}, {50}, true);
-    CHECK(equal(curve_points({Runs{&offline}}), {0, 250}));
-    CHECK_EQUAL(curve_points({Runs{&long_one}})[1], 500.0);
+    CHECK(equal(curve_points({&offline}), {0, 250}));
+    CHECK_EQUAL(curve_points({&long_one})[1], 500.0);
     // 760 has no value; 1010 is the final one and shows at the last point
     CHECK(equal(resampled(run, &Run::length, {0, 249, 250, 500, 750, 900, 1000}), {50, 40, 30, 30, 20, 20, 10}));
 }
@@ -201,7 +201,7 @@ TEST(length_five_counts_from_the_evaluation_after_which_it_never_left) {
 }
 
 TEST(each_length_falls_into_the_bar_whose_label_says_so) {
-    std::vector<double> counts(bins.size(), 0);
+    std::vector<double> counts(bar_labels.size(), 0);
     for (int length = 1; length <= 100; ++length) {
         const std::vector<double> one = count_lengths({static_cast<double>(length)});
         size_t found = 0;
@@ -210,8 +210,8 @@ TEST(each_length_falls_into_the_bar_whose_label_says_so) {
             if (one[bin] != 1) continue;
             ++found;
             int first = 0, last = 0;  // read back from the label
-            const int fields = std::sscanf(bins[bin].label, "%d–%d", &first, &last);
-            if (fields == 0) CHECK(std::string(bins[bin].label) == "≤ 5" && length <= 5);
+            const int fields = std::sscanf(bar_labels[bin], "%d–%d", &first, &last);
+            if (fields == 0) CHECK(std::string(bar_labels[bin]) == "≤ 5" && length <= 5);
             if (fields == 1) CHECK_EQUAL(length, first);
             if (fields == 2) CHECK(first <= length && length <= last);
         }
@@ -282,6 +282,15 @@ TEST(report_states_what_the_folders_hold) {
     CHECK_EQUAL(count(curve, ">paper: "), size_t{2});
     CHECK_EQUAL(count(curve, "stroke-dasharray"), size_t{2});  // DT's, and in the legend
     CHECK_EQUAL(count(curve, ">DT<") + count(curve, ">ODT<") + count(curve, ">WODTEM<"), size_t{3});
+
+    // Every row of a table has a cell for each column of its header.
+    size_t cells = 0, rows = 0;
+    for (const std::string& line : split(markdown, '\n')) {
+        if (cells > 0 && !line.empty()) CHECK_EQUAL(count(line, "|"), cells);
+        cells = count(line, "|");
+        rows += cells > 0;
+    }
+    CHECK_EQUAL(rows, size_t{(2 + 3) + (2 + 6) + (2 + 6)});  // two lines of a header, then the methods or the runs
 
     std::reverse(folders.begin(), folders.end());  // the order of the arguments does not matter
     report(folders, out);
