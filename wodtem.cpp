@@ -24,6 +24,14 @@
 #include <string>
 #include <vector>
 
+#include "gridworld.hpp"
+#include "memory.hpp"
+#include "mujoco_env.hpp"
+#include "nn.hpp"
+
+// Files, words and pictures, in which no loop counts: compiled quickly, not for speed.
+#pragma GCC push_options
+#pragma GCC optimize("O1")
 #include "data/collect.hpp"
 #include "data/command_line.hpp"
 #include "data/console.hpp"
@@ -34,11 +42,8 @@
 #include "data/run_folder.hpp"
 #include "data/settings.hpp"
 #include "data/state.hpp"
-#include "gridworld.hpp"
-#include "memory.hpp"
-#include "mujoco_env.hpp"
-#include "nn.hpp"
 #include "tests/trace.hpp"
+#pragma GCC pop_options
 
 // ---------------------------------------------------------------------------------------------------------------------
 // State. Everything that changes during a run lies in plain structs, so that a checkpoint can list it. S and A stand
@@ -870,8 +875,8 @@ void command_train(const Arguments& arguments) {
     for (const PlannedRun& run : runs) updates.push_back(expected_updates(run.settings));
     for (size_t i = 0; i < runs.size(); ++i) {
         announce(runs[i]);
-        TrainOptions options{kernel_of(arguments), thread_count(arguments), static_cast<double>(seconds),
-                             runs[i].label};
+        TrainOptions options{kernel_of(arguments), thread_count(arguments, runs[i].settings),
+                             static_cast<double>(seconds), runs[i].label};
         for (size_t later = i + 1; later < runs.size(); ++later) options.later_updates += updates[later];
         train(runs[i].settings, runs[i].folder, options);
     }
@@ -912,9 +917,9 @@ void command_import(const Arguments& arguments) {
 
 // Seconds that a run would take on this machine: the time of an update, averaged over three after a first one that
 // allocates, times the number of updates to expect.
-double estimated_seconds(Settings settings) {
+double estimated_seconds(Settings settings, const Kernel& kernel) {
     if (settings.task != "gridworld") settings.behaviour = "random";
-    Compute compute(best_kernel(), processor_count());
+    Compute compute(kernel, processor_count());
     Run run(compute, settings, *make_environment(settings));
     begin_run(run, make_data_set(settings));
     update(run);
@@ -926,10 +931,11 @@ double estimated_seconds(Settings settings) {
 // With --estimate each method's update is timed on this machine first.
 void command_sweep(const Arguments& arguments) {
     const std::vector<Settings> sweep = swept_settings(arguments);
+    const Kernel& kernel = kernel_of(arguments);
     double seconds = 0;
     if (arguments.has("--estimate"))
-        for (const Settings& settings : sweep) seconds += estimated_seconds(settings);
-    print_sweep(sweep, seed_list(arguments["--seeds"]), arguments.has("--estimate"), seconds);
+        for (const Settings& settings : sweep) seconds += estimated_seconds(settings, kernel);
+    print_sweep(sweep, arguments, seconds);
 }
 
 // Without --steps as many rows as D4RL's data set has.
@@ -953,8 +959,11 @@ void command_report(const Arguments& arguments) {
 }
 
 // `bench` and `check` measure and judge the functions above, so they are included behind them.
+#pragma GCC push_options
+#pragma GCC optimize("O1")
 #include "tests/bench.hpp"
 #include "tests/check.hpp"
+#pragma GCC pop_options
 
 const Command commands[] = {
     {"train", "TASK", 1, 1, "offline phase, online phase, evaluations; continues what is there", command_train,

@@ -36,10 +36,10 @@ inline const Option option_table[] = {
     {"train import sweep", "--preset", "NAME", "small", "paper: Tables I and II as printed; small: less of it"},
     {"train", "--seed", "N", "", "seed of everything but the data set; default 0"},
     {"train", "--seeds", "A-B", "", "several seeds, one after the other"},
-    {"train import", "--set", "NAME=VALUE", "", "any setting (see `wodtem tasks TASK`); may be repeated"},
+    {"train import sweep", "--set", "NAME=VALUE", "", "any setting (see `wodtem tasks TASK`); may be repeated"},
     {"train import trace", "--physics", "NAME", "",
      "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
-    {"train import check", "--dataset", "FILE", "",
+    {"train import sweep check", "--dataset", "FILE", "",
      "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
     {"train", "--weights", "MODEL", "",
      "begin with a model's network, temperature and normaliser, not with random ones"},
@@ -63,8 +63,10 @@ inline const Option option_table[] = {
     {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
     {"train eval import bench check", "--kernel", "NAME", "auto",
      "of matrix products: avx512, avx2, portable; auto: the best there is"},
+    {"train eval import sweep bench check", "--precision", "NAME", "fp32",
+     "of matrix products: fp32, or bf16, whose sums stay fp32 (avx512, on request portable)"},
     {"train eval collect bench check", "--threads", "N", "0",
-     "worker threads; 0: one per core; results do not depend on it"},
+     "worker threads; 0: one per core, in train one alone for a small network; results do not depend on it"},
     {"bench", "--json", nullptr, "", "of updates: print one JSON array"},
 };
 
@@ -246,16 +248,29 @@ inline int thread_count(const Arguments& arguments) {
     return asked > 0 ? static_cast<int>(asked) : processor_count();
 }
 
-// The kernel of --kernel. Errors: usage.kernel names those of this machine.
+// Threads for a run: where none are named, one if an update takes about a millisecond or less. Threads would then wait
+// for each other more than they compute, and for whole time slices on a busy machine.
+inline int thread_count(const Arguments& arguments, const Settings& settings) {
+    const double weights = 12.0 * static_cast<double>(settings.layers * settings.width * settings.width);
+    const double products = weights * static_cast<double>(settings.batch_size * (3 * settings.context_length - 1));
+    return arguments["--threads"] == "0" && products < 1e7 ? 1 : thread_count(arguments);
+}
+
+// The kernel of --kernel and --precision. "auto" never chooses the imitation of bf16 in portable code. Errors:
+// usage.kernel names the kernels of this machine.
 inline const Kernel& kernel_of(const Arguments& arguments) {
-    const std::string& name = arguments["--kernel"];
+    const std::string &name = arguments["--kernel"], &precision = arguments["--precision"];
     std::string available;
     for (const Kernel* kernel : kernels) {
         if (!kernel->supported()) continue;
-        if (name == "auto" || name == kernel->name) return *kernel;
-        available += std::string(available.empty() ? "" : ", ") + kernel->name;
+        const bool chosen = name == kernel->name || (name == "auto" && kernel != &kernel_portable_bf16);
+        if (chosen && precision == kernel->precision) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name + " " + kernel->precision;
     }
-    fail("usage.kernel", "kernel \"%s\" is not there; this machine has: %s (or auto)", name.c_str(), available.c_str());
+    fail("usage.kernel",
+         "this machine has no kernel \"%s\" for precision \"%s\"; it has: %s. Choose with --kernel and --precision "
+         "(portable bf16 is an imitation, and slow)",
+         name.c_str(), precision.c_str(), available.c_str());
 }
 
 // The best kernel that gives the bits of a run's setting `arithmetic`. Errors: usage.kernel.
@@ -265,14 +280,28 @@ inline const Kernel& kernel_for(const std::string& arithmetic) {
     fail("usage.kernel", "this machine has no kernel of arithmetic %s", arithmetic.c_str());
 }
 
+// `text` as one word of a shell command: between single quotes where a character could mean something to a shell.
+inline std::string shell_word(const std::string& text) {
+    const auto plain = [](unsigned char c) { return std::isalnum(c) || std::strchr("_-+=.,:/@%", c); };
+    if (!text.empty() && std::all_of(text.begin(), text.end(), plain)) return text;
+    std::string word = "'";
+    for (const char c : text) word += c == '\'' ? std::string("'\\''") : std::string(1, c);
+    return word + "'";
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Settings from the command line.
 
 // given: a file; "random": none, so ten episodes of random actions and the online phase alone; "": the file of the
-// task's id, where a data set has that name. Errors: dataset.missing.
+// task's id. Errors: dataset.missing, also where no data set has that name.
 inline void choose_data_set(Settings& settings, const std::string& given) {
     const PublishedDataSet* published = find_published(settings.task);
-    if (given == "random" || (given.empty() && !published)) {
+    if (given.empty() && !published)
+        fail("dataset.missing",
+             "%s is no data set's name: name one (wodtem tasks lists them), give a file with --dataset, or say "
+             "--dataset random, which begins with ten episodes of random actions and has no offline phase",
+             settings.task.c_str());
+    if (given == "random") {
         set_from(settings, "behaviour", "random", "chosen: there is no data set");
         if (settings.method != "dt")
             set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
@@ -310,6 +339,8 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
     if (settings.task != "gridworld") {
         settings.mujoco = mujoco_version();
         choose_data_set(settings, arguments["--dataset"]);
+    } else if (arguments.has("--dataset")) {
+        fail("usage.option", "the grid world makes its own data set; leave --dataset out");
     }
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
     apply_assignments(settings, arguments.assignments);
@@ -371,25 +402,31 @@ inline void announce(const PlannedRun& run) {
                  run.settings.task.c_str(), run.settings.preset.c_str(), run.folder.c_str(), run.folder.c_str());
 }
 
-// One for each method of a sweep, all checked. Errors: usage.*.
+// One for each method of a sweep, all checked but for the data set, which its machine must have. Errors: usage.*.
 inline std::vector<Settings> swept_settings(const Arguments& arguments) {
     std::vector<Settings> sweep;
     for (const std::string& method : split(arguments["--methods"], ',')) {
         const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
         sweep.push_back(default_settings(task, method, arguments["--preset"]));
+        apply_assignments(sweep.back(), arguments.assignments);
         check_together(sweep.back());
     }
     return sweep;
 }
 
 // One train command a line; in an estimate all lines are comments. seconds: of one seed of each method.
-inline void print_sweep(const std::vector<Settings>& sweep, const std::vector<int64_t>& seeds, bool estimate,
-                        double seconds) {
+inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arguments, double seconds) {
+    const bool estimate = arguments.has("--estimate");
+    const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
+    std::string shared;
+    if (arguments.has("--dataset")) shared += " --dataset " + shell_word(arguments["--dataset"]);
+    if (arguments["--precision"] != "fp32") shared += " --precision " + shell_word(arguments["--precision"]);
+    for (const std::string& assignment : arguments.assignments) shared += " --set " + shell_word(assignment);
     for (const Settings& settings : sweep)
         for (const int64_t seed : seeds)
-            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld\n", estimate ? "# " : "",
+            std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld%s\n", estimate ? "# " : "",
                         settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
-                        static_cast<long long>(seed));
+                        static_cast<long long>(seed), shared.c_str());
     if (estimate)
         std::printf("# about %.1f hours on this machine, one after the other; what is interrupted continues\n",
                     seconds * static_cast<double>(seeds.size()) / 3600);

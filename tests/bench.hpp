@@ -314,7 +314,7 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
                  layers = static_cast<double>(run.agent.settings.layers);
     const double operations = 2 * static_cast<double>(episodes) *
                               ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d),
-                 bytes = 12 * layers * d * d * static_cast<double>(kernel.element_bytes);
+                 bytes = 12 * layers * d * d * 4.0 / kernel.k_a_word;
     measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]) +
                       "; share of the products' own rate or the memory's speed",
                   std::to_string(episodes) + " episodes, " + label(kernel), time, operations, bytes,
