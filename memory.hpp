@@ -76,6 +76,7 @@ void check_column(const char* what, const std::vector<Number>& column, size_t st
 }
 
 // Validates a trajectory and computes both returns from its rewards; targets used while acting play no part.
+// Errors: memory.shape, memory.not_finite.
 inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, double gamma) {
     const size_t T = trajectory.rewards.size();
     if (T == 0) fail("memory.shape", "a trajectory has no steps, expected at least one");
@@ -308,17 +309,16 @@ struct Points {
     }
 };
 
-// A bucket k-d tree (Friedman, Bentley and Finkel, 1977), kept balanced by partial rebuilding (Overmars, 1983). An inner
-// node divides its entries by the order of (coordinate, entry number), so identical points are divided like any others,
-// and an entry belongs to exactly one leaf. A leaf holds up to 16 entries; their coordinates lie side by side, so that
-// one pass of vector code gives all distances. An inner node holds more than 8, and neither of its children more than
-// two thirds of them; the highest node that breaks this is built anew. Insertions and removals take O(log(n)^2)
-// amortised, whatever their order. No result depends on the tree's shape.
+// A bucket k-d tree (Friedman, Bentley and Finkel, 1977), kept balanced by partial rebuilding (Overmars, 1983). An
+// inner node divides its entries by the order of (coordinate, entry number), so identical points are divided like any
+// others, and an entry belongs to exactly one leaf. A leaf holds up to 16 entries; their coordinates lie side by side,
+// so that one pass of vector code gives all distances. An inner node holds more than 8, and neither of its children
+// more than two thirds of them, rounded up; the highest node that breaks this is built anew. Insertions and removals
+// take O(log(n)^2) amortised, whatever their order. No result depends on the tree's shape.
 struct KdTree {
     static constexpr uint32_t lanes = 16;         // entries in a full leaf
     static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `dim` in a leaf
     static constexpr size_t longest_path = 48;    // planes above a leaf: log(2^31 / 9) / log(3/2) = 47.6, and the last
-
     template <class Number>
     struct alignas(64) Lanes : std::array<Number, lanes> {};
     struct Node {
@@ -327,7 +327,6 @@ struct KdTree {
         float split;     // inner node: the high child's entries begin at (split, numbers[node]) in the order above
         uint32_t count;  // entries below it, or in the leaf
     };
-
     std::vector<Node> nodes;                // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
     std::vector<uint32_t> numbers;          // [node]
     std::vector<Lanes<float>> coordinates;  // [place, dim]
@@ -416,8 +415,7 @@ struct KdTree {
         build_node(points, node, place, order);
     }
 
-    // Appends the entries below a node to `order` and frees the pairs below. Returns the place of the lowest leaf, which
-    // belongs to none of these pairs.
+    // Appends the entries below a node to `order`, frees the pairs below, and returns the place that the node got.
     uint32_t collect(uint32_t index, std::vector<uint32_t>& order) {
         const Node node = nodes[index];
         if (node.dim == leaf) {
@@ -544,6 +542,7 @@ struct EpisodicMemory {
     std::priority_queue<HeapItem, std::vector<HeapItem>, std::greater<>> heap;
     KdTree tree;  // over `projected`
 
+    // Errors: memory.config. Reserves the memory for all entries, so that no update copies a column.
     EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
         : config(settings),
           S(config.state_dim),
@@ -567,11 +566,13 @@ struct EpisodicMemory {
     }
 
     size_t size() const { return e.size(); }
+    Points points() const { return {projected.data(), age.data(), dim}; }
 
     // ---- eq. (4): the table
 
     // Every state of a relabelled trajectory, in the order of time. A look-up that nothing can satisfy comes first: it
     // brings the leaves to which the next 64 states belong into the cache, all at the same time.
+    // Errors: memory.shape, memory.not_finite, both before anything is changed.
     Changes update(const Trajectory& trajectory) {
         const size_t T = trajectory.rewards.size();
         check_column("states", trajectory.states, T, S);
@@ -625,8 +626,6 @@ struct EpisodicMemory {
         tree.insert(points(), entry);
         return entry;
     }
-
-    Points points() const { return {projected.data(), age.data(), dim}; }
 
     // An access: an insertion, an exact hit in update(), a neighbour that passed epsilon in a look-up.
     void count_access(uint32_t entry) {
@@ -692,8 +691,10 @@ struct EpisodicMemory {
     }
 
     // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for
-    // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. Sixteen walks take one step
-    // each in turn, so that the next node of a walk can come from memory while the others compute.
+    // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. limit: reach(), the largest
+    // distance of a neighbour. The K closest of those within epsilon are those within epsilon of the K closest.
+    // Sixteen walks take one step each in turn, so that the next node of a walk can come from memory while the others
+    // compute. The tests hold this to a scan of all entries.
     EACH_TARGET Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped,
                                        float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
@@ -711,7 +712,7 @@ struct EpisodicMemory {
         return found;
     }
 
-    // The largest float below epsilon.
+    // The largest float below epsilon: distances are floats, so q <= reach() says q < epsilon.
     float reach() const {
         const float bound = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
         return bound < config.epsilon ? bound : std::nextafter(bound, -INFINITY);
@@ -758,6 +759,7 @@ struct EpisodicMemory {
     // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
     // The largest e is subtracted first: e reaches thousands and exp(89) overflows a float. `uniform` lies in [0, 1);
     // the neighbour is drawn by the inverse of the cumulative distribution. Returns the action [action_dim].
+    // Errors: memory.no_neighbours for an empty K(s_q). No caller asks then: such a step has w = 1.
     const float* advised_action(std::span<const Neighbour> found, double uniform) const {
         if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to advise");
         double best = e[found[0].entry], total = 0.0;
@@ -788,22 +790,18 @@ struct EpisodicMemory {
 
     // Derives from the columns what is not stored in them. The columns must fit together and no key may repeat.
     void rebuild_derived() {
-        const uint32_t n = static_cast<uint32_t>(size());
-        slots.assign(std::bit_ceil(config.capacity + config.capacity / 2 + 1), no_entry);  // load at most 2/3
-        for (uint32_t i = 0; i < n; ++i) slots[find_slot(key_of(i))] = i;
-        heap = {};
-        std::vector<uint32_t> all(n);
+        std::vector<uint32_t> all(size());
         std::iota(all.begin(), all.end(), 0u);
+        slots.assign(std::bit_ceil(config.capacity + config.capacity / 2 + 1), no_entry);  // load at most 2/3
+        for (const uint32_t entry : all) slots[find_slot(key_of(entry))] = entry;
+        heap = {};
         tree = {};
         tree.build_node(points(), 0, tree.take_pair(dim), all);
     }
 };
 
-// ---------------------------------------------------------------------------------------------------------------------
-// Eq. (5) as the paper writes it. The tests hold is_optimal() to it, and nearest() to a scan of all entries.
-
-// e-hat(s_q) = sum_k p_k e_k, of K(s_q); NaN, that is unknown, for an empty one. Training compares by is_optimal(),
-// which does not form it.
+// e-hat(s_q) = sum_k p_k e_k, eq. (5) as the paper writes it, of K(s_q); NaN, that is unknown, for an empty one.
+// Training compares by is_optimal(), which does not form it; the tests hold the two to each other.
 inline double approximate_return(const EpisodicMemory& memory, std::span<const Neighbour> found) {
     double sum = 0.0, normaliser = 0.0;
     for (size_t k = 0; k < found.size(); ++k) {

@@ -268,8 +268,8 @@ void consult_memory(Run& run, Batch& batch) {
         const std::span<const Neighbour> found = batch.neighbours[i];
         run.memory.count_accesses(found);  // every neighbour counts, whether or not it is followed
         run.tally.unmatched_pairs += found.empty();
-        // Q has taken in all of D, this step too. So, unless the table has forgotten it or exclude_self is set, s_c is as
-        // a rule its own first neighbour, at distance 0, and has e >= d_c there.
+        // Q has taken in all of D, this step too. So, unless the table has forgotten it or exclude_self is set, s_c is
+        // as a rule its own first neighbour, at distance 0, and has e >= d_c there.
         const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);  // eq. (5)
         batch.weights[i] = static_cast<float>(EpisodicMemory::weight(optimal, agent.settings.alpha));
         if (optimal) continue;
