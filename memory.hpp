@@ -20,6 +20,9 @@
 
 #include "nn.hpp"  // and with it the other standard headers
 
+#pragma GCC push_options
+#pragma GCC optimize("O3")
+
 // The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
 namespace Stream {
 constexpr uint32_t batch = 3;           // step: update; index: window of the batch
@@ -76,6 +79,7 @@ void check_column(const char* what, const std::vector<Number>& column, size_t st
 }
 
 // Validates a trajectory and computes both returns from its rewards; targets used while acting play no part.
+// Errors: memory.shape, memory.not_finite.
 inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, double gamma) {
     const size_t T = trajectory.rewards.size();
     if (T == 0) fail("memory.shape", "a trajectory has no steps, expected at least one");
@@ -171,43 +175,35 @@ struct Environments {
     std::vector<Environment*> pointers;
 
     Environments(const Environment& environment, int64_t count) {
-        for (int64_t i = 0; i < count; ++i) {
-            copies.push_back(environment.clone());
-            pointers.push_back(copies.back().get());
-        }
+        for (int64_t i = 0; i < count; ++i) pointers.push_back(copies.emplace_back(environment.clone()).get());
     }
     std::span<Environment* const> all() const { return pointers; }
-    std::span<Environment* const> first() const { return std::span(pointers).first(1); }
+    std::span<Environment* const> first() const { return all().first(1); }
 };
 
 // Plays one episode in each environment, numbered from `first` on, in lockstep up to termination or the time limit.
-// choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over. Environments step
-// on `threads`, if given.
+// choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over.
 template <class Choose>
 std::vector<Episode> play(std::span<Environment* const> environments, const Random& resets, uint64_t first,
-                          Choose&& choose, Threads* threads = nullptr) {
+                          Choose&& choose, Threads* threads) {
     const EnvironmentSpec spec = environments[0]->spec();
     std::vector<Episode> episodes(environments.size());
+    std::vector<Episode*> running;
     for (size_t i = 0; i < episodes.size(); ++i) {
         episodes[i].number = first + i;
         episodes[i].state.resize(spec.state_dim);
         environments[i]->reset(resets, first + i, episodes[i].state.data());
+        running.push_back(&episodes[i]);
     }
-    for (int t = 0; t < spec.max_episode_steps; ++t) {
-        std::vector<Episode*> running;
-        for (Episode& episode : episodes)
-            if (!episode.over) running.push_back(&episode);
-        if (running.empty()) break;
+    for (int t = 0; t < spec.max_episode_steps && !running.empty(); ++t) {
         const std::vector<float> actions = choose(std::span<Episode* const>(running));
-        const auto step = [&](int i, int) {
+        threads->run(static_cast<int>(running.size()), [&](int i, int) {
             Environment& environment = *environments[running[i] - episodes.data()];
             running[i]->step(environment, &actions[i * spec.action_dim], spec.action_dim);
-        };
-        const int count = static_cast<int>(running.size());
-        if (threads) threads->run(count, step);
-        for (int i = 0; !threads && i < count; ++i) step(i, 0);
+        });
         for (const Episode* episode : running)
             if (episode->thrown) std::rethrow_exception(episode->thrown);
+        std::erase_if(running, [](const Episode* episode) { return episode->over; });
     }
     return episodes;
 }
@@ -216,8 +212,9 @@ std::vector<Episode> play(std::span<Environment* const> environments, const Rand
 template <class Choose>
 Episode play(Environment& environment, const Random& resets, uint64_t number, Choose&& choose) {
     Environment* const environments[] = {&environment};
-    auto episodes = play(environments, resets, number, [&](auto running) { return choose(*running[0]); });
-    return std::move(episodes[0]);
+    Threads alone(1);
+    return std::move(play(
+        environments, resets, number, [&](auto running) { return choose(*running[0]); }, &alone)[0]);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -240,8 +237,7 @@ struct ReplayBuffer {
     // data set counts as higher. So "first in, first out" begins with the worst offline trajectory, as in ODT's code.
     void start(std::vector<Trajectory> candidates) {
         std::stable_sort(candidates.begin(), candidates.end(), lower_return);
-        if (candidates.size() > capacity)
-            candidates.erase(candidates.begin(), candidates.end() - static_cast<std::ptrdiff_t>(capacity));
+        candidates.erase(candidates.begin(), candidates.end() - std::min(capacity, candidates.size()));
         trajectories = std::move(candidates);
         next = 0;
         count_steps();
@@ -294,13 +290,6 @@ struct Neighbour {
     uint32_t entry;
 };
 
-// WODTEM sec. IV-B.2, q: q(s_q, s_k) = ||s_q - s_k||^2, not its root.
-inline float squared_distance(const float* a, const float* b, size_t dim) {
-    float sum = 0.0f;
-    for (size_t d = 0; d < dim; ++d) sum += (a[d] - b[d]) * (a[d] - b[d]);
-    return sum;
-}
-
 // K(s_q) of many queries s_q.
 struct Neighbourhoods {
     size_t K = 0;
@@ -315,6 +304,7 @@ struct Neighbourhoods {
 struct Points {
     const float* rows;     // [entry, dim]
     const uint64_t* ages;  // [entry]
+    size_t dim;
 
     // The order of neighbours. Ties: smaller distance, then older entry.
     bool closer(const Neighbour& a, const Neighbour& b) const {
@@ -322,68 +312,62 @@ struct Points {
     }
 };
 
-// A bucket k-d tree (Friedman, Bentley and Finkel, 1977), kept shallow like a scapegoat tree (Galperin and Rivest,
-// 1993). An inner node divides its entries by the order of (coordinate, entry number), so identical points are divided
-// like any others, and an entry belongs to exactly one leaf. A leaf holds up to 16 entries; their coordinates lie side
-// by side, so that one pass of vector code gives all distances. A subtree too deep for its number of entries is built
-// anew, and so is the whole tree when its leaves hold fewer than 4 entries on average. Insertions and removals take
-// O(log(n)^2) amortised, whatever their order. No result depends on the tree's shape.
+// A bucket k-d tree (Friedman, Bentley and Finkel, 1977), kept balanced by partial rebuilding (Overmars, 1983). An
+// inner node divides its entries by the order of (coordinate, entry number), so identical points are divided like any
+// others, and an entry belongs to exactly one leaf. A leaf holds up to 16 entries; their coordinates lie side by side,
+// so that one pass of vector code gives all distances. An inner node holds more than 8, and neither of its children
+// more than two thirds of them, rounded up; the highest node that breaks this is built anew. Insertions and removals
+// take O(log(n)^2) amortised, whatever their order. No result depends on the tree's shape.
 struct KdTree {
     static constexpr uint32_t lanes = 16;         // entries in a full leaf
     static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `dim` in a leaf
-    static constexpr size_t longest_path = 48;    // planes above a leaf: log(2^31 / 16) / log(3/2) = 46.2, and one more
-
+    static constexpr size_t longest_path = 48;    // planes above a leaf: log(2^31 / 9) / log(3/2) = 47.6, and the last
     template <class Number>
     struct alignas(64) Lanes : std::array<Number, lanes> {};
     struct Node {
         uint32_t child;  // inner node: its low child, the high child follows it. Leaf: its place in the arrays below
         uint32_t dim;
-        float split;      // inner node: (split, number) is the first of the high child's entries in the order above
-        uint32_t number;  // leaf: of its entries
+        float split;     // inner node: the high child's entries begin at (split, numbers[node]) in the order above
+        uint32_t count;  // entries below it, or in the leaf
     };
-
-    size_t dim = 0, size = 0;
     std::vector<Node> nodes;                // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
+    std::vector<uint32_t> numbers;          // [node]
     std::vector<Lanes<float>> coordinates;  // [place, dim]
     std::vector<Lanes<uint32_t>> entries;   // [place] there is one place for each pair
     std::vector<uint32_t> free_pairs;
 
-    // A tree of the entries in `order`.
-    void build(const Points& points, size_t point_dim, std::vector<uint32_t> order) {
-        *this = {point_dim, order.size(), {}, {}, {}, {}};
-        build_node(points, 0, take_pair(), order);
-    }
-
-    // Halves the entries along the dimension of the largest extent until they fit leaves. The low child gets the node's
-    // place and the high child that of the new pair.
+    // Makes a node of the entries in `order`: halves them along the dimension of the largest extent until they fit
+    // leaves. The low child gets the node's place and the high child that of the new pair.
     void build_node(const Points& points, uint32_t node, uint32_t place, std::span<uint32_t> order) {
-        nodes[node] = {place, leaf, 0.0f, 0};
+        nodes[node] = {place, leaf, 0.0f, static_cast<uint32_t>(order.size())};
         if (order.size() <= lanes) {
-            for (const uint32_t entry : order) put(points, nodes[node], entry);
+            for (size_t lane = 0; lane < order.size(); ++lane) put(points, place, lane, order[lane]);
             return;
         }
         std::pair<float, uint32_t> widest = {};  // (extent, dimension)
-        for (uint32_t d = 0; d < dim; ++d) {
+        for (uint32_t d = 0; d < points.dim; ++d) {
             float least = INFINITY, most = -INFINITY;
             for (const uint32_t entry : order) {
-                least = std::min(least, points.rows[entry * dim + d]);
-                most = std::max(most, points.rows[entry * dim + d]);
+                least = std::min(least, points.rows[entry * points.dim + d]);
+                most = std::max(most, points.rows[entry * points.dim + d]);
             }
             widest = std::max(widest, {most - least, d});
         }
+        const auto x = [&](uint32_t entry) { return points.rows[entry * points.dim + widest.second]; };
         const auto half = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
-        const auto rank = [&](uint32_t entry) { return std::pair(points.rows[entry * dim + widest.second], entry); };
-        std::ranges::nth_element(order, half, {}, rank);
-        const uint32_t pair = take_pair();
-        nodes[node] = {2 * pair, widest.second, rank(*half).first, *half};
+        std::ranges::nth_element(order, half, {}, [&](uint32_t entry) { return std::pair(x(entry), entry); });
+        const uint32_t pair = take_pair(points.dim);
+        nodes[node] = {2 * pair, widest.second, x(*half), nodes[node].count};
+        numbers[node] = *half;
         build_node(points, 2 * pair, place, {order.begin(), half});
         build_node(points, 2 * pair + 1, pair, {half, order.end()});
     }
 
-    uint32_t take_pair() {
+    uint32_t take_pair(size_t dim) {
         if (free_pairs.empty()) {
             free_pairs.push_back(static_cast<uint32_t>(entries.size()));
             nodes.resize(nodes.size() + 2);
+            numbers.resize(nodes.size());
             coordinates.resize(coordinates.size() + dim);
             entries.emplace_back();
         }
@@ -392,76 +376,58 @@ struct KdTree {
         return pair;
     }
 
-    void put(const Points& points, Node& node, uint32_t entry) {
-        const uint32_t lane = node.number++;
-        for (size_t d = 0; d < dim; ++d) coordinates[node.child * dim + d][lane] = points.rows[entry * dim + d];
-        entries[node.child][lane] = entry;
+    void put(const Points& points, size_t place, size_t lane, uint32_t entry) {
+        entries[place][lane] = entry;
+        for (size_t d = 0; d < points.dim; ++d)
+            coordinates[place * points.dim + d][lane] = points.rows[entry * points.dim + d];
     }
 
-    // The nodes from the root to the leaf to which an entry belongs.
-    std::vector<uint32_t> path_to(const Points& points, uint32_t entry) const {
-        std::vector<uint32_t> path = {0};
-        path.reserve(longest_path + 1);
-        while (nodes[path.back()].dim != leaf) {
-            const auto [child, plane_dim, split, number] = nodes[path.back()];
-            const float x = points.rows[entry * dim + plane_dim];
-            path.push_back(child + (x == split ? entry >= number : x > split));
+    // The leaf of an entry, and the highest node above it that loses its balance when the counts of the nodes above the
+    // leaf change by `change`, which they do; where none does, the leaf again.
+    std::pair<uint32_t, uint32_t> descend(const Points& points, uint32_t entry, int change) {
+        uint32_t at = 0, highest = no_entry;
+        while (nodes[at].dim != leaf) {
+            const uint32_t count = nodes[at].count += change;
+            const float x = points.rows[entry * points.dim + nodes[at].dim];
+            const bool high = x == nodes[at].split ? entry >= numbers[at] : x > nodes[at].split;
+            const uint32_t next = nodes[at].child + high;
+            const uint32_t heavier = std::max(nodes[next].count + change, nodes[next ^ 1].count);
+            if (highest == no_entry && (count <= lanes / 2 || heavier > count - count / 3)) highest = at;
+            at = next;
         }
-        return path;
+        return {at, highest == no_entry ? at : highest};
     }
 
-    // Where an overfull leaf lies too deep for the size of the tree, the lowest node above it that it also lies too
-    // deep for is built anew: that node is too small for its height, while its child, of height one less, is not.
     void insert(const Points& points, uint32_t entry) {
-        const std::vector<uint32_t> path = path_to(points, entry);
-        const size_t depth = path.size() - 1;
-        Node& node = nodes[path[depth]];
-        ++size;
-        if (node.number < lanes) return put(points, node, entry);
-        const auto too_small = [](size_t n, size_t height) {
-            return double(n) < lanes * std::pow(1.5, double(height));
-        };
-        std::vector<uint32_t> order = {entry};
-        collect(path[depth], order);
-        size_t height = 0;
-        if (too_small(size, depth))
-            for (; !too_small(order.size(), height); ++height) {
-                collect(path[depth - height] ^ 1, order);
-                free_pairs.push_back(path[depth - height] / 2);
-            }
-        uint32_t lowest = path[depth - height];
-        while (nodes[lowest].dim != leaf) lowest = nodes[lowest].child;
-        build_node(points, path[depth - height], nodes[lowest].child, order);
-        build_if_sparse(points);
+        const auto [at, highest] = descend(points, entry, 1);
+        if (highest == at && nodes[at].count < lanes) return put(points, nodes[at].child, nodes[at].count++, entry);
+        rebuild(points, highest, {entry});
     }
 
     void remove(const Points& points, uint32_t entry) {
-        Node& node = nodes[path_to(points, entry).back()];
-        const uint32_t place = node.child, last = --node.number;
-        const auto lane = std::find(entries[place].begin(), entries[place].end(), entry) - entries[place].begin();
-        entries[place][lane] = entries[place][last];
-        for (size_t d = 0; d < dim; ++d) coordinates[place * dim + d][lane] = coordinates[place * dim + d][last];
-        --size;
-        build_if_sparse(points);
+        const auto [at, highest] = descend(points, entry, -1);
+        const Lanes<uint32_t>& held = entries[nodes[at].child];
+        const auto lane = std::ranges::find(held, entry) - held.begin();
+        put(points, nodes[at].child, lane, held[--nodes[at].count]);
+        if (highest != at) rebuild(points, highest, {});
     }
 
-    void build_if_sparse(const Points& points) {
-        if (4 * (entries.size() - free_pairs.size()) <= size + lanes) return;
-        std::vector<uint32_t> order;
-        collect(0, order);
-        build(points, dim, std::move(order));
+    // Builds a node anew, of the entries below it and those in `order`.
+    void rebuild(const Points& points, uint32_t node, std::vector<uint32_t> order) {
+        const uint32_t place = collect(node, order);
+        build_node(points, node, place, order);
     }
 
-    // Appends the entries below a node to `order` and frees the pairs below.
-    void collect(uint32_t node, std::vector<uint32_t>& order) {
-        const auto [child, plane_dim, split, number] = nodes[node];
-        if (plane_dim == leaf) {
-            order.insert(order.end(), &entries[child][0], &entries[child][0] + number);
-        } else {
-            free_pairs.push_back(child / 2);
-            collect(child, order);
-            collect(child + 1, order);
+    // Appends the entries below a node to `order`, frees the pairs below, and returns the place that the node got.
+    uint32_t collect(uint32_t index, std::vector<uint32_t>& order) {
+        const Node node = nodes[index];
+        if (node.dim == leaf) {
+            order.insert(order.end(), entries[node.child].begin(), entries[node.child].begin() + node.count);
+            return node.child;
         }
+        free_pairs.push_back(node.child / 2);
+        collect(node.child + 1, order);
+        return collect(node.child, order);
     }
 };
 
@@ -471,47 +437,49 @@ struct Walk {
     const float* point;    // [dim]
     uint32_t skipped;      // the entry that is no neighbour
     float reach;           // an entry farther away is none either
-    uint32_t fetched = 0;  // the leaf that has been prefetched, plus 1
-    size_t waiting = 1;    // subtrees to be visited, the last one first: (squared distance to its plane, node)
-    std::array<std::pair<float, uint32_t>, KdTree::longest_path + 1> subtrees = {};
+    uint32_t at = 0;       // the node to be visited next
+    bool fetched = false;  // if that is a leaf: whether it has been prefetched
+    size_t waiting = 0;    // subtrees to be visited then, the last one first: (squared distance to its plane, node)
+    std::array<std::pair<float, uint32_t>, KdTree::longest_path> subtrees = {};
 
     // Visits one node; returns whether there is another to visit. A subtree beyond a plane can be left out if the plane
     // is too far: a point beyond has a coordinate at least that far, and rounding, being monotone, keeps that order in
     // the difference, in its square and in a sum of squares. At equal distances the older entry wins: hence not >=.
-    [[gnu::always_inline]] inline bool step(const KdTree& tree, const Points& points, Neighbourhoods& found) {
-        const uint32_t index = subtrees[waiting - 1].second;
-        const KdTree::Node& node = tree.nodes[index];
+    ALWAYS_INLINE bool step(const KdTree& tree, const Points& points, Neighbourhoods& found) {
+        const KdTree::Node& node = tree.nodes[at];
         if (node.dim != KdTree::leaf) {
             const float gap = point[node.dim] - node.split;
-            const uint32_t near = node.child + (gap > 0.0f);
-            __builtin_prefetch(&tree.nodes[near]);
-            subtrees[waiting - 1] = {gap * gap, near ^ 1};
-            subtrees[waiting++] = {0.0f, near};
-        } else if (fetched != index + 1) {
-            for (size_t d = 0; d < tree.dim; ++d) __builtin_prefetch(&tree.coordinates[node.child * tree.dim + d]);
-            __builtin_prefetch(&tree.entries[node.child]);
-            fetched = index + 1;
-        } else {
-            scan(tree, node, points, found);
-            --waiting;
-            while (waiting > 0 && subtrees[waiting - 1].first > reach) --waiting;
+            at = node.child + (gap > 0.0f);
+            subtrees[waiting++] = {gap * gap, at ^ 1};
+            __builtin_prefetch(&tree.nodes[at]);
+            return true;
         }
-        return waiting > 0;
+        if (!fetched) {
+            for (size_t d = 0; d < points.dim; ++d) __builtin_prefetch(&tree.coordinates[node.child * points.dim + d]);
+            __builtin_prefetch(&tree.entries[node.child]);
+            return fetched = true;
+        }
+        fetched = false;
+        scan(tree, node, points, found);
+        while (waiting > 0 && subtrees[waiting - 1].first > reach) --waiting;
+        if (waiting == 0) return false;
+        at = subtrees[--waiting].second;
+        return true;
     }
 
     // Takes those entries of a leaf that are among the K nearest so far.
-    [[gnu::always_inline]] inline void scan(const KdTree& tree, const KdTree::Node& node, const Points& points,
-                                            Neighbourhoods& found) {
+    // WODTEM sec. IV-B.2, q: q(s_q, s_k) = ||s_q - s_k||^2, not its root; of all entries of the leaf at once.
+    ALWAYS_INLINE void scan(const KdTree& tree, const KdTree::Node& node, const Points& points, Neighbourhoods& found) {
         KdTree::Lanes<float> distance = {};
-        for (size_t d = 0; d < tree.dim; ++d)
+        for (size_t d = 0; d < points.dim; ++d)
 #pragma GCC unroll 1  // vectors of lanes, not of dimensions
             for (size_t i = 0; i < KdTree::lanes; ++i) {
-                const float gap = tree.coordinates[node.child * tree.dim + d][i] - point[d];
+                const float gap = tree.coordinates[node.child * points.dim + d][i] - point[d];
                 distance[i] += gap * gap;
             }
         Neighbour* best = &found.rows[query * found.K];
         size_t& count = found.counts[query];
-        for (size_t i = 0; i < node.number; ++i) {
+        for (size_t i = 0; i < node.count; ++i) {
             const Neighbour next = {distance[i], tree.entries[node.child][i]};
             if (!(next.distance <= reach) || next.entry == skipped) continue;
             if (count == found.K && !points.closer(next, best[count - 1])) continue;
@@ -544,10 +512,9 @@ struct MemoryConfig {
 // beyond, n states share a key by chance with probability n^2 / 2^129: 2e-26 for 4e6. (No defence against an enemy.)
 inline Words4 state_key(const float* state, size_t state_dim) {
     Words4 h = {};
-    for (size_t i = 0; i < state_dim; i += 4) {
-        for (size_t j = i; j < std::min(i + 4, state_dim); ++j)
-            h[j - i] ^= std::bit_cast<uint32_t>(state[j] + 0.0f);  // -0 + 0 = +0; nothing else changes
-        h = philox(h, static_cast<uint32_t>(state_dim), 0x574F4454);
+    for (size_t i = 0; i < state_dim; ++i) {
+        h[i % 4] ^= std::bit_cast<uint32_t>(state[i] + 0.0f);  // -0 + 0 = +0; nothing else changes
+        if (i % 4 == 3 || i + 1 == state_dim) h = philox(h, static_cast<uint32_t>(state_dim), 0x574F4454);
     }
     return h;
 }
@@ -556,13 +523,7 @@ struct EpisodicMemory {
     struct Changes {
         uint64_t inserted = 0, improved = 0, kept = 0, evicted = 0;  // entries; the first three sum to T
     };
-    struct HeapItem {
-        uint64_t priority, age;
-        uint32_t entry;
-        bool operator>(const HeapItem& b) const {
-            return priority > b.priority || (priority == b.priority && age > b.age);
-        }
-    };
+    using HeapItem = std::tuple<uint64_t, uint64_t, uint32_t>;  // (priority, age, entry)
 
     MemoryConfig config;
     size_t S, A;                     // state_dim, action_dim
@@ -584,12 +545,12 @@ struct EpisodicMemory {
     std::priority_queue<HeapItem, std::vector<HeapItem>, std::greater<>> heap;
     KdTree tree;  // over `projected`
 
+    // Errors: memory.config. Reserves the memory for all entries, so that no update copies a column.
     EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
         : config(settings),
           S(config.state_dim),
           A(config.action_dim),
-          dim(config.projected_dim) {
-        if (dim == 0) dim = S;
+          dim(config.projected_dim ? config.projected_dim : config.state_dim) {
         if (config.state_dim < 1 || config.action_dim < 1 || config.projected_dim < 0 || config.K < 1 ||
             config.capacity < 1 || config.capacity > 0x7FFFFFFF || !(config.epsilon >= 0.0) || !(config.tau > 0.0))
             fail("memory.config",
@@ -608,66 +569,66 @@ struct EpisodicMemory {
     }
 
     size_t size() const { return e.size(); }
+    Points points() const { return {projected.data(), age.data(), dim}; }
 
     // ---- eq. (4): the table
 
-    // Every state of a relabelled trajectory, in the order of time.
+    // Every state of a relabelled trajectory, in the order of time. A look-up that nothing can satisfy comes first: it
+    // brings the leaves to which the next 64 states belong into the cache, all at the same time.
+    // Errors: memory.shape, memory.not_finite, both before anything is changed.
     Changes update(const Trajectory& trajectory) {
         const size_t T = trajectory.rewards.size();
         check_column("states", trajectory.states, T, S);
         check_column("actions", trajectory.actions, T, A);
         check_column("discounted returns", trajectory.discounted_returns, T, 1);
         Changes changes;
-        std::vector<Words4> key(T);
-        for (size_t t = 0; t < T; ++t) {
-            key[t] = state_key(&trajectory.states[t * S], S);
-            __builtin_prefetch(&slots[key[t][0] & (slots.size() - 1)]);  // find_slot() looks there first
-        }
-        std::vector<float> point(dim);
-        for (size_t t = 0; t < T; ++t) {
-            project(&trajectory.states[t * S], point.data());
-            update_one(changes, key[t], point.data(), &trajectory.actions[t * A], trajectory.discounted_returns[t]);
+        for (size_t first = 0; first < T; first += 64) {
+            const size_t n = std::min<size_t>(64, T - first);
+            std::vector<Words4> key(n);
+            std::vector<float> at(n * dim);
+            for (size_t i = 0; i < n; ++i) {
+                key[i] = state_key(&trajectory.states[(first + i) * S], S);
+                __builtin_prefetch(&slots[key[i][0] & (slots.size() - 1)]);  // find_slot() looks there first
+                project(&trajectory.states[(first + i) * S], &at[i * dim]);
+            }
+            nearest(at, std::vector(n, no_entry), -1.0f);
+            for (size_t i = 0, t = first; i < n; ++i, ++t)
+                update_one(changes, key[i], &at[i * dim], &trajectory.actions[t * A], trajectory.discounted_returns[t]);
         }
         return changes;
     }
 
-    // WODTEM eq. (4): Q(s) <- Q(s) if stored and e >= d; (s, a, d) if stored and e < d; (s, a, d) if not stored.
-    // key: state_key of s; point: s projected.
+    // WODTEM eq. (4): Q(s) <- Q(s) if stored and e >= d; (s, a, d) if stored and e < d; (s, a, d) if not stored. Equal
+    // returns keep the older action. key: state_key of s; point: s projected.
     void update_one(Changes& changes, const Words4& key, const float* point, const float* action, double d) {
-        const uint32_t entry = slots[find_slot(key)];
-        if (entry == no_entry) {
-            ++changes.inserted;
-            changes.evicted += size() == config.capacity;
-            return insert(key, point, action, d);
-        }
+        uint32_t entry = slots[find_slot(key)];
+        const bool stored = entry != no_entry;
+        if (!stored) entry = insert(changes, key, point);
         count_access(entry);
-        if (e[entry] < d) {
-            ++changes.improved;
-            e[entry] = d;
-            std::copy_n(action, A, &actions[entry * A]);
-        } else {  // equal returns keep the older action
+        if (stored && e[entry] >= d) {
             ++changes.kept;
+            return;
         }
+        ++(stored ? changes.improved : changes.inserted);
+        e[entry] = d;
+        std::copy_n(action, A, &actions[entry * A]);
     }
 
-    void insert(const Words4& key, const float* point, const float* action, double d) {
+    // A new entry for a state: the next one, or in a full table that which is evicted. Its a^e and e are left open.
+    uint32_t insert(Changes& changes, const Words4& key, const float* point) {
         const bool full = size() == config.capacity;
+        changes.evicted += full;
         const uint32_t entry = full ? evict() : static_cast<uint32_t>(size());
         if (!full)
             for_each_column(*this, [](auto, auto& column, size_t width) { column.resize(column.size() + width); });
         std::copy_n(key.data(), 4, &keys[size_t{entry} * 4]);
         std::copy_n(point, dim, &projected[entry * dim]);
-        std::copy_n(action, A, &actions[entry * A]);
-        e[entry] = d;
         age[entry] = insertions++;
         priority[entry] = 0;
-        count_access(entry);
         slots[find_slot(key)] = entry;
         tree.insert(points(), entry);
-        if (full) heap.push(heap_item(entry));
+        return entry;
     }
-
-    Points points() const { return {projected.data(), age.data()}; }
 
     // An access: an insertion, an exact hit in update(), a neighbour that passed epsilon in a look-up.
     void count_access(uint32_t entry) {
@@ -678,18 +639,18 @@ struct EpisodicMemory {
     HeapItem heap_item(uint32_t entry) const { return {priority[entry], age[entry], entry}; }
 
     // WODTEM sec. IV-B.1, full table: "When Q is filled, we remove the least frequently accessed entry"; ties: the
-    // oldest.
+    // oldest. Returns its number, which goes to the entry that is inserted next.
     // Accesses do not touch the heap: an item holds the priority its entry had when it was pushed, which is at most
     // what it has now. So when the smallest item proves up to date, no entry can be below it; when it does not, it goes
-    // back with its present priority. Each access makes at most one item stale: amortised, one push per access.
+    // back with its present priority. Each access makes at most one item stale: amortised, one push per access. The
+    // item of the entry evicted last, whose successor may be below it, is still on top and goes back first.
     uint32_t evict() {
         for (uint32_t i = 0; heap.size() < size(); ++i) heap.push(heap_item(i));
-        uint32_t entry = heap.top().entry;
-        for (; heap.top().priority != priority[entry]; entry = heap.top().entry) {
+        uint32_t entry = std::get<2>(heap.top());
+        for (; heap.top() != heap_item(entry); entry = std::get<2>(heap.top())) {
             heap.pop();
             heap.push(heap_item(entry));
         }
-        heap.pop();
         empty_slot(find_slot(key_of(entry)));
         tree.remove(points(), entry);
         return entry;
@@ -708,16 +669,13 @@ struct EpisodicMemory {
         return slot;
     }
 
-    // Removal without tombstones: each later entry of the run that may move into the hole does, and leaves a new hole.
-    void empty_slot(size_t hole) {
-        const size_t mask = slots.size() - 1;
-        for (size_t slot = (hole + 1) & mask; slots[slot] != no_entry; slot = (slot + 1) & mask) {
-            const size_t home = keys[4 * size_t{slots[slot]}] & mask;
-            if (((slot - home) & mask) < ((slot - hole) & mask)) continue;  // its home lies behind the hole
-            slots[hole] = slots[slot];
-            hole = slot;
+    // Removal without tombstones: the entries of the run that follows are put in again.
+    void empty_slot(size_t slot) {
+        slots[slot] = no_entry;
+        while (slots[slot = (slot + 1) & (slots.size() - 1)] != no_entry) {
+            const uint32_t moved = std::exchange(slots[slot], no_entry);
+            slots[find_slot(key_of(moved))] = moved;
         }
-        slots[hole] = no_entry;
     }
 
     // ---- sec. IV-B.2: neighbours
@@ -736,14 +694,14 @@ struct EpisodicMemory {
     }
 
     // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for
-    // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. Sixteen walks take one step
-    // each in turn, so that the next node of a walk can come from memory while the others compute.
-    EACH_TARGET Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped) const {
+    // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. limit: reach(), the largest
+    // distance of a neighbour. The K closest of those within epsilon are those within epsilon of the K closest.
+    // Sixteen walks take one step each in turn, so that the next node of a walk can come from memory while the others
+    // compute. The tests hold this to a scan of all entries.
+    EACH_TARGET Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped,
+                                       float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
-        // The largest float below epsilon.
-        float limit = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
-        if (limit >= config.epsilon) limit = std::nextafter(limit, -INFINITY);
         std::vector<Walk> walks;
         for (size_t begun = 0; begun < n || !walks.empty();) {
             for (; begun < n && walks.size() < 16; ++begun)
@@ -757,6 +715,12 @@ struct EpisodicMemory {
         return found;
     }
 
+    // The largest float below epsilon: distances are floats, so q <= reach() says q < epsilon.
+    float reach() const {
+        const float bound = static_cast<float>(std::min<double>(config.epsilon, std::numeric_limits<float>::max()));
+        return bound < config.epsilon ? bound : std::nextafter(bound, -INFINITY);
+    }
+
     // K(s_q) of n states [n, state_dim]. Changes nothing, so many threads may search at once; then count_accesses() on
     // each result in a fixed order, before the next update() (which may give an entry number to another state).
     Neighbourhoods search(const float* states, size_t n) const {
@@ -766,7 +730,7 @@ struct EpisodicMemory {
             project(states + i * S, &at[i * dim]);
             if (config.exclude_self) skipped[i] = slots[find_slot(state_key(states + i * S, S))];
         }
-        return nearest(at, skipped);
+        return nearest(at, skipped, reach());
     }
 
     void count_accesses(std::span<const Neighbour> found) {
@@ -798,6 +762,7 @@ struct EpisodicMemory {
     // WODTEM eq. (6): p(a_k^e | s_q, s_k, e_k) = exp(e_k / tau) / sum_k1 exp(e_k1 / tau); a-hat(s_q) is drawn from it.
     // The largest e is subtracted first: e reaches thousands and exp(89) overflows a float. `uniform` lies in [0, 1);
     // the neighbour is drawn by the inverse of the cumulative distribution. Returns the action [action_dim].
+    // Errors: memory.no_neighbours for an empty K(s_q). No caller asks then: such a step has w = 1.
     const float* advised_action(std::span<const Neighbour> found, double uniform) const {
         if (found.empty()) fail("memory.no_neighbours", "no neighbour within epsilon: there is no action to advise");
         double best = e[found[0].entry], total = 0.0;
@@ -828,33 +793,18 @@ struct EpisodicMemory {
 
     // Derives from the columns what is not stored in them. The columns must fit together and no key may repeat.
     void rebuild_derived() {
-        const uint32_t n = static_cast<uint32_t>(size());
-        slots.assign(std::bit_ceil(config.capacity + config.capacity / 2 + 1), no_entry);  // load at most 2/3
-        for (uint32_t i = 0; i < n; ++i) slots[find_slot(key_of(i))] = i;
-        heap = {};
-        std::vector<uint32_t> all(n);
+        std::vector<uint32_t> all(size());
         std::iota(all.begin(), all.end(), 0u);
-        tree.build(points(), dim, std::move(all));
+        slots.assign(std::bit_ceil(config.capacity + config.capacity / 2 + 1), no_entry);  // load at most 2/3
+        for (const uint32_t entry : all) slots[find_slot(key_of(entry))] = entry;
+        heap = {};
+        tree = {};
+        tree.build_node(points(), 0, tree.take_pair(dim), all);
     }
 };
 
-// ---------------------------------------------------------------------------------------------------------------------
-// The look-up and eq. (5) as the paper writes them. The tests hold nearest() and is_optimal() to these two.
-
-// K(s_q) of a projected s_q [dim] by a scan of all entries; `skipped` is passed over.
-inline std::vector<Neighbour> nearest_plain(const EpisodicMemory& memory, const float* point, uint32_t skipped) {
-    std::vector<Neighbour> found;
-    for (uint32_t i = 0; i < memory.size(); ++i) {
-        const float distance = squared_distance(&memory.projected[i * memory.dim], point, memory.dim);
-        if (i != skipped && distance < memory.config.epsilon) found.push_back({distance, i});
-    }
-    std::sort(found.begin(), found.end(), [&](auto& a, auto& b) { return memory.points().closer(a, b); });
-    found.resize(std::min(found.size(), static_cast<size_t>(memory.config.K)));
-    return found;
-}
-
-// e-hat(s_q) = sum_k p_k e_k of eq. (5), of K(s_q); NaN, that is unknown, for an empty one. Training compares by
-// is_optimal(), which does not form it.
+// e-hat(s_q) = sum_k p_k e_k, eq. (5) as the paper writes it, of K(s_q); NaN, that is unknown, for an empty one.
+// Training compares by is_optimal(), which does not form it; the tests hold the two to each other.
 inline double approximate_return(const EpisodicMemory& memory, std::span<const Neighbour> found) {
     double sum = 0.0, normaliser = 0.0;
     for (size_t k = 0; k < found.size(); ++k) {
@@ -863,3 +813,5 @@ inline double approximate_return(const EpisodicMemory& memory, std::span<const N
     }
     return sum / normaliser;
 }
+
+#pragma GCC pop_options

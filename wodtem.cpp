@@ -198,7 +198,9 @@ void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const fl
         to.push_back(spec.discrete_actions > 0 ? action[i] : clamp_action(action[i]));
 }
 
-// Some windows of an update's batch: n steps, packed. c runs over the steps of a window.
+// Some windows of an update's batch: n steps, packed. c runs over the steps of a window, which are C^t of eqs. (2) and
+// (9). The paper makes of one sub-trajectory samples (s^c, g^c) of 1 to |C^t| steps. Attention is causal, so one pass
+// over the window gives pi(. | s^c, g^c) for all c at once: what stands behind step c does not enter it.
 // departs from ODT's code: packed, not padded on the left to context_length, so that no mask is needed.
 struct Batch {
     SequenceBatch sequences;
@@ -228,6 +230,8 @@ Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
             const int t = at.start + c;
             const float* state = &trajectory.states[t * agent.spec.state_dim];
             const float* action = &trajectory.actions[t * agent.spec.action_dim];
+            // The network reads g_t times reward_scale. d_t stays in units of the reward: eqs. (5) and (7) compare it
+            // with e, which is a d_t too, and eq. (6) takes exp(e) as it is.
             const double g = trajectory.returns_to_go[t] * agent.settings.reward_scale;
             batch.sequences.returns_to_go.push_back(static_cast<float>(g));
             append_normalised(batch.sequences.states, agent.normaliser, state);
@@ -269,6 +273,8 @@ void consult_memory(Run& run, Batch& batch) {
         const std::span<const Neighbour> found = batch.neighbours[i];
         run.memory.count_accesses(found);  // every neighbour counts, whether or not it is followed
         run.tally.unmatched_pairs += found.empty();
+        // Q has taken in all of D, this step too. So, unless the table has forgotten it or exclude_self is set, s_c is
+        // as a rule its own first neighbour, at distance 0, and has e >= d_c there.
         const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);  // eq. (5)
         batch.weights[i] = static_cast<float>(EpisodicMemory::weight(optimal, agent.settings.alpha));
         if (optimal) continue;
@@ -324,6 +330,7 @@ Objective<T> objective(Tape<T>& tape, const Policy<T>& policy, const Batch& batc
     // WODTEM eq. (9): L = E[ -1/|C^t| sum_c w log pi(a_c | s^c, g^c) - 1/|C^t| sum_c (1 - w) log pi(a-hat | s^c, g^c) ]
     // WODTEM eq. (2): J is L with w = 1. Both terms read one distribution; the action tokens stay the buffer's.
     // departs from ODT's code: the mean runs over a window's steps, then over windows, as written; not over all steps.
+    // log_prob: [n, 1], the logarithm of a probability, or for continuous actions of a density (it may be above 0).
     result.L = combine(tape, T(1), weighted_sum(tape, log_prob(tape, policy, batch.actions.data()), observed.data()),
                        T(1), weighted_sum(tape, log_prob(tape, policy, batch.advised_actions.data()), advised.data()));
     if (!constrain_entropy) {
@@ -340,7 +347,8 @@ Objective<T> objective(Tape<T>& tape, const Policy<T>& policy, const Batch& batc
 
 // Dual ascent on lambda, eqs. (1) and (8): lambda ascends lambda (eta - H-bar), by one step of Adam on log lambda. By
 // the chain rule the gradient with respect to log lambda is lambda (eta - H-bar) as well; Adam descends, hence the
-// sign. entropy: H-bar of the same batch. ODT's code: learning rate 1e-4, no decay, no clipping, no warm-up.
+// sign. So lambda grows while the policy's entropy is below eta, and shrinks towards 0 while it is above. entropy:
+// H-bar of the same batch, in nats per step. ODT's code: learning rate 1e-4, no decay, no clipping, no warm-up.
 void update_lambda(Compute& compute, Temperature& temperature, const Settings& settings, double entropy) {
     OptimizerConfig adam;
     adam.rule = OptimizerConfig::Rule::adamw;
@@ -439,8 +447,10 @@ int sampled_action(const float* log_p, int count, double uniform) {
     return count - 1;
 }
 
-// The action [action_dim] of one row of the policy, as it is stored and given to the environment. random: one stream,
-// one number per dimension, at (episode, t).
+// The action [action_dim] of one row of the policy, as it is stored and given to the environment. policy.output [rows,
+// columns]: log-probabilities of the discrete_actions, or one value per action dimension. random: one stream, one
+// number per dimension, at (episode, t). Sec. III-B: evaluation takes "the mean vector" or "the maximum probability";
+// with a Gaussian under tanh that is tanh of its mean, as in ODT's code.
 std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy, int row, Act act,
                                  const Random& random, uint64_t episode, uint32_t t) {
     const int columns = policy.output.columns, first = row * columns;
@@ -643,7 +653,7 @@ void interact(Run& run, const Observer& observer) {
 
 // WODTEM sec. IV-B.3, step 5: online fine-tuning (fig. 2) on D_online, which begins with the best trajectories of
 // D_offline. Each iteration: one episode, then updates_per_iteration updates; every eval_every iterations an
-// evaluation.
+// evaluation. The paper's budget is online_steps, in steps of the environment; updates are not counted by it.
 void online_phase(Run& run, const Observer& observer) {
     const Settings& settings = run.agent.settings;
     Progress& p = run.progress;

@@ -180,7 +180,7 @@ void compare_with_naive(const MemoryConfig& config, int operations, uint32_t sal
 }
 
 // The entries in the tree are `inside`, each in one lane, with its coordinates and on its side of every plane above;
-// every node and every place is used once or free, leaves are not too empty and no path is too long.
+// every node and every place is used once or free, counts are right, the tree is balanced and no path is too long.
 void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
     using Rank = std::pair<float, uint32_t>;  // (coordinate, entry), the order in which planes divide
     struct Box {
@@ -190,21 +190,23 @@ void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
     std::vector<uint32_t> met;
     std::set<uint32_t> nodes, places;
     size_t deepest = 0;
-    const auto below = [&](const auto& self, uint32_t node, const Box& box, size_t depth) -> void {
-        const auto [child, dim, split, number] = tree.nodes.at(node);
+    const auto below = [&](const auto& self, uint32_t node, const Box& box, size_t depth) -> size_t {
+        const auto [child, dim, split, count] = tree.nodes.at(node);
         CHECK(nodes.insert(node).second);
         deepest = std::max(deepest, depth);
         if (dim != KdTree::leaf) {
             Box low = box, high = box;
-            low.high[dim] = std::min(box.high[dim], Rank{split, number});
-            high.low[dim] = std::max(box.low[dim], Rank{split, number});
-            self(self, child, low, depth + 1);
-            self(self, child + 1, high, depth + 1);
-            return;
+            const Rank plane = {split, tree.numbers.at(node)};
+            low.high[dim] = std::min(box.high[dim], plane);
+            high.low[dim] = std::max(box.low[dim], plane);
+            const size_t in_low = self(self, child, low, depth + 1), in_high = self(self, child + 1, high, depth + 1);
+            CHECK_EQUAL(size_t{count}, in_low + in_high);
+            CHECK(count > KdTree::lanes / 2 && 3 * std::max(in_low, in_high) <= 2 * size_t{count} + 2);
+            return count;
         }
-        CHECK(number <= KdTree::lanes);
+        CHECK(count <= KdTree::lanes);
         CHECK(places.insert(child).second);
-        for (uint32_t lane = 0; lane < number; ++lane) {
+        for (uint32_t lane = 0; lane < count; ++lane) {
             const uint32_t entry = tree.entries.at(child)[lane];
             met.push_back(entry);
             for (size_t d = 0; d < memory.dim; ++d) {
@@ -213,20 +215,21 @@ void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
                 CHECK(box.low[d] <= x && x < box.high[d]);
             }
         }
+        return count;
     };
     below(below, 0, {std::vector<Rank>(memory.dim, {-INFINITY, 0}), std::vector<Rank>(memory.dim, {INFINITY, 0})}, 0);
     std::sort(met.begin(), met.end());
     std::sort(inside.begin(), inside.end());
     CHECK(met == inside);
-    CHECK_EQUAL(tree.size, inside.size());
     CHECK_EQUAL(tree.nodes.size(), 2 * tree.entries.size());
+    CHECK_EQUAL(tree.numbers.size(), tree.nodes.size());
     CHECK_EQUAL(places.size(), tree.entries.size() - tree.free_pairs.size());
     CHECK_EQUAL(nodes.size(), 2 * places.size() - 1);
+    // An inner node holds more than 8, and its lighter child about a third: no leaves of fewer than 4 on average.
+    CHECK(4 * places.size() <= inside.size() + KdTree::lanes);
     for (const uint32_t pair : tree.free_pairs) CHECK(nodes.insert(2 * pair).second && places.insert(pair).second);
-    CHECK(4 * (tree.entries.size() - tree.free_pairs.size()) <= tree.size + KdTree::lanes);
-    // A tree was at most four times as large and a leaf when the deepest leaf was made.
-    const double largest = 4.0 * static_cast<double>(tree.size) + KdTree::lanes;
-    CHECK(static_cast<double>(deepest) <= std::log(largest / KdTree::lanes) / std::log(1.5) + 1);
+    const double largest = static_cast<double>(std::max<size_t>(inside.size(), 1));
+    CHECK(static_cast<double>(deepest) <= std::max(0.0, std::log(largest / 4) / std::log(1.5)));
     CHECK(deepest <= KdTree::longest_path);
 }
 
@@ -268,6 +271,25 @@ std::vector<float> state_of(Shape shape, const Random& random, int dim, uint64_t
     return state;
 }
 
+// q(s_q, s_k) = ||s_q - s_k||^2, summed in float in the order of the dimensions.
+float squared_distance(const float* a, const float* b, size_t dim) {
+    float sum = 0.0f;
+    for (size_t d = 0; d < dim; ++d) sum += (a[d] - b[d]) * (a[d] - b[d]);
+    return sum;
+}
+
+// K(s_q) of a projected s_q [dim] by a scan of all entries; `skipped` is passed over.
+std::vector<Neighbour> nearest_plain(const EpisodicMemory& memory, const float* point, uint32_t skipped) {
+    std::vector<Neighbour> found;
+    for (uint32_t i = 0; i < memory.size(); ++i) {
+        const float distance = squared_distance(&memory.projected[i * memory.dim], point, memory.dim);
+        if (i != skipped && distance < memory.config.epsilon) found.push_back({distance, i});
+    }
+    std::sort(found.begin(), found.end(), [&](auto& a, auto& b) { return memory.points().closer(a, b); });
+    found.resize(std::min(found.size(), static_cast<size_t>(memory.config.K)));
+    return found;
+}
+
 // The tree against the scan, for many points at once and for one alone: around the table's states and at them.
 void compare_with_plain(const EpisodicMemory& memory, uint64_t salt, uint32_t n = 40) {
     const Random random{test_seed(), Stream::exploration};
@@ -282,11 +304,11 @@ void compare_with_plain(const EpisodicMemory& memory, uint64_t salt, uint32_t n 
         }
         skipped.push_back(memory.size() > 0 && i % 3 == 0 ? static_cast<uint32_t>(near) : no_entry);
     }
-    const Neighbourhoods found = memory.nearest(points, skipped);
+    const Neighbourhoods found = memory.nearest(points, skipped, memory.reach());
     for (uint32_t i = 0; i < n; ++i) {
         const float* at = &points[i * memory.dim];
         CHECK(same(found[i], nearest_plain(memory, at, skipped[i])));
-        if (i % 8 == 0) CHECK(same(found[i], memory.nearest({at, at + memory.dim}, {skipped[i]})[0]));
+        if (i % 8 == 0) CHECK(same(found[i], memory.nearest({at, at + memory.dim}, {skipped[i]}, memory.reach())[0]));
     }
 }
 
@@ -580,7 +602,8 @@ TEST(the_tree_survives_any_order_of_coming_and_going) {
         to.push_back(from.back());
         from.pop_back();
         if (i % 997 != 0) continue;
-        Neighbourhoods found = memory.nearest(state_of(Shape::uniform, random, 3, i), {no_entry});
+        check_tree(memory, inside);
+        Neighbourhoods found = memory.nearest(state_of(Shape::uniform, random, 3, i), {no_entry}, memory.reach());
         std::vector<Neighbour> expected;
         const std::vector<float> point = state_of(Shape::uniform, random, 3, i);
         for (const uint32_t entry : inside)
@@ -628,7 +651,8 @@ TEST(the_largest_states_overflow_to_infinite_distances_and_no_further) {
     for (const auto& state : {zero, low, high}) {
         std::vector<float> point(2);
         memory.project(state.data(), point.data());
-        CHECK(same(memory.nearest(point, {no_entry})[0], nearest_plain(memory, point.data(), no_entry)));
+        CHECK(
+            same(memory.nearest(point, {no_entry}, memory.reach())[0], nearest_plain(memory, point.data(), no_entry)));
     }
 }
 
