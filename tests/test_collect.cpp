@@ -277,10 +277,9 @@ TEST(ant_maze_actions_are_the_walkers_plus_noise) {
 
 TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
     const Scratch scratch("antmaze");
-    const MujocoTask& task = task_of("antmaze-umaze");
     const std::string path = scratch / "set.hdf5";
     constexpr size_t steps = 4 * 701;
-    collect_antmaze(path, task, steps, {"test", test_seed()}, embedded_policy(walker_name), [](size_t) {});
+    collect_data_set_file("antmaze-umaze-v2", path, steps, test_seed(), "", 1, {});
     const Hdf5File file = open_hdf5(path);
     const std::pair<const char*, const char*> types[] = {
         {"observations", "float32"}, {"actions", "float32"},    {"rewards", "float32"},    {"terminals", "float32"},
@@ -291,8 +290,9 @@ TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
     CHECK(rows.count == steps && rows.state_dim == 29 && rows.action_dim == 8);
     // Nine in ten episodes arrive, so of four hardly ever none does.
     CHECK(std::count(rows.rewards.begin(), rows.rewards.end(), 1.0f) > 0);
-    CHECK_FAILS("collect.policy",
-                collect_antmaze(path, task, 10, {"", 0}, embedded_policy("hopper-medium"), [](size_t) {}));
+    const std::string other = scratch / "hopper.safetensors";
+    sac::save_policy(other, embedded_policy("hopper-medium"));
+    CHECK_FAILS("collect.policy", collect_data_set_file("antmaze-umaze-v2", path, 10, 0, other, 1, {}));
     CHECK_FAILS("collect.policy", embedded_policy("hopper-expert"));
 }
 
@@ -325,7 +325,9 @@ std::string replay_bytes(const MujocoTask& task, const Training& training, size_
         int asked = 0;
         Watch watch;
         watch.stop = [&] { return ++asked > stop; };
-        const auto make = [&] { collect_medium_replay(path, task, steps, origin, training, checkpoint, watch); };
+        const auto make = [&] {
+            collect_medium_replay(path, task, steps, origin, training, one_thread(), checkpoint, watch);
+        };
         if (stop < 1 << 30) {
             CHECK_FAILS("collect.stopped", make());
             CHECK(std::filesystem::exists(checkpoint));
@@ -455,8 +457,8 @@ TEST(a_replay_set_has_d4rls_layout) {
     const Scratch scratch("layout");
     const MujocoTask& task = task_of("hopper");
     const std::string path = scratch / "hopper_medium_replay-v2.hdf5";
-    collect_medium_replay(path, task, 500, {"test", test_seed()}, small_training(task, 500), scratch / "checkpoint",
-                          {});
+    collect_medium_replay(path, task, 500, {"test", test_seed()}, small_training(task, 500), one_thread(),
+                          scratch / "checkpoint", {});
     const Hdf5File file = open_hdf5(path);
     for (const char* name : {"observations", "next_observations", "actions", "rewards", "infos/qpos", "infos/qvel"}) {
         CHECK(file.find(name) && file.find(name)->shape[0] == 500);
