@@ -3,16 +3,12 @@
 // actor-critic run (sac.hpp) up to the published return of the medium set, and medium, the actions of the policy with
 // which such a run ended.
 //
-// In order: policies; training to a level; layouts; the families; the body of `wodtem collect`.
+// In order: policies; training to a level; the families of data sets; the body of `wodtem collect`.
 // Promises: a data set is a function of (task, steps, seed, policy, machine), however often its making was stopped; its
 // metadata say how it was made, so that nobody takes it for D4RL's. Leaves out: expert and random sets.
 #pragma once
 
-#include <chrono>
 #include <filesystem>
-#include <functional>
-#include <string>
-#include <vector>
 
 #include "antmaze.hpp"
 #include "console.hpp"
@@ -42,25 +38,25 @@ WODTEM_EMBED(wodtem_ant_medium, "data/policies/ant-medium.safetensors")
 WODTEM_EMBED(wodtem_antmaze_walker, "data/policies/antmaze-walker.safetensors")
 
 // A policy that this program holds: "hopper-medium" and so on, or "antmaze-walker". Errors: collect.policy.
-inline sac::SavedPolicy embedded_policy(const std::string& name) {
-    struct Embedded {
-        const char *name, *begin, *end;
-    };
-    for (const Embedded& one : {Embedded{"hopper-medium", wodtem_hopper_medium, wodtem_hopper_medium_end},
-                                {"walker2d-medium", wodtem_walker2d_medium, wodtem_walker2d_medium_end},
-                                {"halfcheetah-medium", wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end},
-                                {"ant-medium", wodtem_ant_medium, wodtem_ant_medium_end},
-                                {walker_name, wodtem_antmaze_walker, wodtem_antmaze_walker_end}})
-        if (name == one.name)
-            return sac::policy_of(parse_safetensors(std::string(one.begin, one.end), "the policy " + name));
-    fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
+inline sac::Network<float> embedded_policy(const std::string& name) {
+    const std::map<std::string, std::pair<const char*, const char*>> embedded = {
+        // begin and end
+        {"hopper-medium", {wodtem_hopper_medium, wodtem_hopper_medium_end}},
+        {"walker2d-medium", {wodtem_walker2d_medium, wodtem_walker2d_medium_end}},
+        {"halfcheetah-medium", {wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end}},
+        {"ant-medium", {wodtem_ant_medium, wodtem_ant_medium_end}},
+        {walker_name, {wodtem_antmaze_walker, wodtem_antmaze_walker_end}}};
+    if (!embedded.contains(name))
+        fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
+    const auto [begin, end] = embedded.at(name);
+    return sac::policy_of(parse_safetensors(std::string(begin, end), "the policy " + name));
 }
 
 // A policy must fit the task's states and actions. Errors: collect.policy.
-inline void check_policy(const sac::SavedPolicy& policy, int inputs, int actions) {
-    if (policy.network.inputs() != inputs || policy.network.outputs() != 2 * actions)
+inline void check_policy(const sac::Network<float>& policy, int inputs, int actions) {
+    if (policy.inputs() != inputs || policy.outputs() != 2 * actions)
         fail("collect.policy", "the policy has %d inputs and %d actions, expected %d and %d; give this task's policy",
-             policy.network.inputs(), policy.network.outputs() / 2, inputs, actions);
+             policy.inputs(), policy.outputs() / 2, inputs, actions);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -228,14 +224,14 @@ inline sac::Learner train_policy(Environment& environment, const Training& train
         std::snprintf(text, sizeof text, "%.2f", x);
         return std::string(text);
     };
-    sac::save_policy(path, {learner.policy,
-                            {{"name", training.name},
-                             {"physics", "d4rl"},
-                             {"return", number(returns.mean())},
-                             {"return_deviation", number(returns.deviation())},
-                             {"seed", std::to_string(training.settings.seed)},
-                             {"steps", std::to_string(learner.progress.steps)},
-                             {"updates", std::to_string(learner.progress.updates)}}});
+    sac::save_policy(path, learner.policy,
+                     {{"name", training.name},
+                      {"physics", "d4rl"},
+                      {"return", number(returns.mean())},
+                      {"return_deviation", number(returns.deviation())},
+                      {"seed", std::to_string(training.settings.seed)},
+                      {"steps", std::to_string(learner.progress.steps)},
+                      {"updates", std::to_string(learner.progress.updates)}});
     return learner;
 }
 
@@ -251,9 +247,8 @@ struct Origin {
 // Writes the first `steps` rows; add(file) writes what a family has beside them. The arrays are those of D4RL's layout:
 // eight for the mazes, terminals as booleans in maze2d and as numbers in antmaze; for the gym tasks see CollectedRows.
 template <class T>
-void write_set(
-    const std::string& path, const CollectedRows<T>& rows, size_t steps, const Origin& origin,
-    const std::function<void(Hdf5Writer&)>& add = [](Hdf5Writer&) {}) {
+void write_set(const std::string& path, const CollectedRows<T>& rows, size_t steps, const Origin& origin,
+               const std::function<void(Hdf5Writer&)>& add = {}) {
     Hdf5Writer file(path);
     rows.each_array([&](const char* name, auto array, bool is_table) {
         const auto& values = rows.*array;
@@ -261,7 +256,7 @@ void write_set(
         const size_t width = values.size() / rows.length();
         file.add(name, is_table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
     });
-    add(file);
+    if (add) add(file);
     file.text("metadata/made_by", origin.command);
     file.text("metadata/note", "a stand-in made by wodtem, not D4RL's data");
     file.text("metadata/mujoco", mujoco_version());
@@ -270,29 +265,23 @@ void write_set(
 }
 
 // D4RL's metadata/policy, for states of state_dim numbers; inputs that the policy does not have get weights of 0.
-inline void write_policy(Hdf5Writer& file, const sac::SavedPolicy& policy, size_t state_dim) {
+inline void write_policy(Hdf5Writer& file, sac::Network<float> policy, size_t state_dim) {
     file.text("metadata/policy/nonlinearity", "relu");
     file.text("metadata/policy/output_distribution", "tanh_gaussian");
-    const auto add = [&](std::string name, Shape shape, std::span<const float> values) {
-        std::vector<float> widened;
-        if (name == "fc0.weight") {
-            const size_t seen = shape[1];
-            widened.resize(shape[0] * state_dim);
-            for (size_t unit = 0; unit < shape[0]; ++unit)
-                std::copy_n(&values[unit * seen], seen, &widened[unit * state_dim]);
-            shape[1] = state_dim;
-            values = widened;
-        }
+    Parameter<float>& first = policy.parameters[0];
+    const size_t seen = std::exchange(first.shape[1], state_dim);
+    for (size_t unit = 0; unit < first.shape[0]; ++unit)
+        first.value.insert(first.value.begin() + static_cast<ptrdiff_t>(unit * state_dim + seen), state_dim - seen, 0);
+    sac::each_policy_tensor(policy.parameters, [&](std::string name, const Shape& shape, auto values) {
         std::replace(name.begin(), name.end(), '.', '/');
         file.add("metadata/policy/" + name, shape, values);
-    };
-    sac::each_policy_tensor(policy.network.parameters, add);
+    });
 }
 
 // The first `steps` rows of whole episodes of sampled actions. An episode in which the simulation breaks down is left
 // out. `progress` gets the number of rows after every episode. Errors: collect.policy.
 inline void collect_medium(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                           sac::SavedPolicy policy, const std::function<void(size_t)>& progress) {
+                           sac::Network<float> policy, const std::function<void(size_t)>& progress) {
     check_policy(policy, live_columns(task), task.action_dim);
     LiveTask environment(task);
     Compute compute(best_kernel(), 1);
@@ -300,7 +289,7 @@ inline void collect_medium(const std::string& path, const MujocoTask& task, size
     CollectedRows<float> set;
     for (uint64_t number = data_set_episodes; set.length() < steps; ++number) {
         std::vector<float> log_probs;
-        const Episode episode = sac::play_sampled(tape, policy.network, environment, origin.seed, number, &log_probs);
+        const Episode episode = sac::play_sampled(tape, policy, environment, origin.seed, number, &log_probs);
         if (!episode.error.empty()) continue;
         environment.rows.log_probs = std::move(log_probs);
         set.append(environment.rows);
@@ -387,7 +376,7 @@ inline void collect_data_set_file(const std::string& id, const std::string& path
     const MujocoTask* task = find_mujoco_task(id);
     if (!task && id != walker_name) fail("collect.task", "no task of this program has data sets named %s", id.c_str());
     const auto policy = [&](const std::string& name) {
-        return policy_path.empty() ? embedded_policy(name) : sac::load_policy(policy_path);
+        return policy_path.empty() ? embedded_policy(name) : sac::policy_of(read_safetensors(policy_path));
     };
     const auto show = [&](size_t rows) {
         const size_t done = std::min(rows, steps);
@@ -407,9 +396,9 @@ inline void collect_data_set_file(const std::string& id, const std::string& path
     } else if (task->rules == Rules::maze2d) {
         write_set(path, collect_maze_data_set(*task, steps, seed, show), steps, origin);
     } else if (task->rules == Rules::antmaze) {
-        sac::SavedPolicy walker = policy(walker_name);
+        sac::Network<float> walker = policy(walker_name);
         check_policy(walker, walking_ant_state, task->action_dim);
-        write_set(path, collect_ant_maze_set(*task, steps, seed, walker.network, show), steps, origin);
+        write_set(path, collect_ant_maze_set(*task, steps, seed, walker, show), steps, origin);
     } else {
         collect_medium(path, *task, steps, origin, policy(std::string(task->name) + "-medium"), show);
     }

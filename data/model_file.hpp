@@ -9,18 +9,10 @@
 // and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
 #pragma once
 
-#include <algorithm>
-#include <charconv>
-#include <cmath>
-#include <cstdint>
 #include <filesystem>
-#include <set>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "safetensors.hpp"
-#include "settings.hpp"
+#include "settings.hpp"  // and with it the other standard headers
 
 // Where the contents of a model file lie in memory; reading writes to these places.
 struct ModelContents {
@@ -66,7 +58,7 @@ inline std::string some_names(const std::vector<std::string>& names) {
 }
 
 // Reads the parameters. Beside them the file may have the tensors `known`, and no others.
-// Errors: model.names names the missing and the unknown ones; those of TensorFile::read_into, for a wrong shape or dtype.
+// Errors: model.names names the missing and the unknown ones; those of read_into() for a wrong shape or dtype.
 inline void load_parameters(ModelContents& model, const TensorFile& file, std::set<std::string> known) {
     std::vector<std::string> missing, unknown;
     for (const Parameter<float>& parameter : model.parameters) {
@@ -182,29 +174,6 @@ inline std::vector<std::pair<std::string, Shape>> unused_odt_tensors(const Trans
     return unused;
 }
 
-// Everything that a strict load_state_dict of ODT's model expects, and nothing else. What it has no place for is text in
-// the metadata.
-inline TensorFile odt_file(const ModelContents& model) {
-    TensorFile file = network_file(model, "ODT state_dict");
-    const auto set_text = [&](const char* name, const std::vector<float>& values) {
-        std::string& text = file.metadata[name];
-        for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
-    };
-    set_text("log_temperature", model.log_temperature.value);
-    set_text("state_mean", model.state_mean);
-    set_text("state_std", model.state_std);
-    std::vector<uint8_t> causal_mask(1024 * 1024);  // [query, key]
-    for (size_t i = 0; i < causal_mask.size(); ++i) causal_mask[i] = i % 1024 <= i / 1024;
-    for (const auto& [name, shape] : unused_odt_tensors(model.config)) {
-        const float value = name.ends_with(".masked_bias") ? -1e4f : 0.0f;
-        if (name.ends_with(".attn.bias"))
-            file.add(name, shape, causal_mask);
-        else
-            file.add(name, shape, std::vector<float>(*byte_size(shape, DType::F32) / sizeof value, value));
-    }
-    return file;
-}
-
 // The numbers of a tensor, or of the metadata entry of its name, where they are separated by spaces; nothing if the
 // file has neither. Errors: import.metadata.
 inline std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape) {
@@ -224,24 +193,6 @@ inline std::vector<float> tensor_or_text(const TensorFile& file, const std::stri
     return values;
 }
 
-// Reads a file from ODT's code or from odt_file(). Returns whether the file has the statistics of the states; without
-// them the caller must find them elsewhere, and then call check_model(). Errors: model.names, import.metadata.
-inline bool load_odt(ModelContents& model, const TensorFile& file) {
-    std::set<std::string> known = {"log_temperature", "state_mean", "state_std"};
-    for (const auto& [name, shape] : unused_odt_tensors(model.config)) known.insert(name);
-    load_parameters(model, file, known);
-    load_counts(model, file);
-    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {});
-    if (!log_temperature.empty()) model.log_temperature.value = log_temperature;
-    const size_t state_dim = static_cast<size_t>(model.config.state_dim);
-    model.state_mean = tensor_or_text(file, "state_mean", {state_dim});
-    model.state_std = tensor_or_text(file, "state_std", {state_dim});
-    if (model.state_mean.empty() != model.state_std.empty())
-        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
-             file.path.c_str());
-    return !model.state_mean.empty();
-}
-
 // A model in memory that neither trains nor acts.
 struct StoredModel {
     Settings settings;
@@ -256,28 +207,58 @@ struct StoredModel {
     }
 };
 
-// The command `export --odt`: from a model file (or run folder) to `out`.
+// The command `export --odt`: from a model file (or run folder) to `out`, which gets everything that a strict
+// load_state_dict of ODT's model expects, and nothing else. What it has no place for is text in the metadata.
+// Errors: those of open_model() and load_model(), file.write.
 inline void export_odt(const std::string& given, const std::string& out) {
     const TensorFile file = open_model(given);
     StoredModel model{settings_in(file)};
     ModelContents contents = model.contents();
     load_model(contents, file);
-    const TensorFile exported = odt_file(contents);
+    TensorFile exported = network_file(contents, "ODT state_dict");
+    const auto set_text = [&](const char* name, const std::vector<float>& values) {
+        std::string& text = exported.metadata[name];
+        for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
+    };
+    set_text("log_temperature", model.log_temperature.value);
+    set_text("state_mean", model.state_mean);
+    set_text("state_std", model.state_std);
+    std::vector<uint8_t> causal_mask(1024 * 1024);  // [query, key]
+    for (size_t i = 0; i < causal_mask.size(); ++i) causal_mask[i] = i % 1024 <= i / 1024;
+    for (const auto& [name, shape] : unused_odt_tensors(model.network.config)) {
+        const float value = name.ends_with(".masked_bias") ? -1e4f : 0.0f;
+        if (name.ends_with(".attn.bias"))
+            exported.add(name, shape, causal_mask);
+        else
+            exported.add(name, shape, std::vector<float>(*byte_size(shape, DType::F32) / sizeof value, value));
+    }
     write_safetensors(out, exported);
     std::printf(
         "%s: %zu tensors for a strict load_state_dict of ODT's model%s\n", out.c_str(), exported.tensors.size(),
         model.spec.discrete_actions > 0 ? ", were there not predict_action.logits: ODT has no discrete actions" : "");
 }
 
-// The command `import`: from a file under ODT's names to a model file. find_statistics(model) is called if the file has
-// none of the states. Errors: model.*, import.*, safetensors.*.
+// The command `import`: from a file of ODT's code or of export_odt() to a model file. find_statistics(model) is called
+// if the file has none of the states. Errors: model.*, import.*, safetensors.*.
 template <class FindStatistics>
 void import_odt(const TensorFile& file, const Settings& settings, const std::string& out,
                 FindStatistics&& find_statistics) {
     require_room(file, settings);
     StoredModel model{settings};
     ModelContents contents = model.contents();
-    if (!load_odt(contents, file)) {
+    std::set<std::string> known = {"log_temperature", "state_mean", "state_std"};
+    for (const auto& [name, shape] : unused_odt_tensors(model.network.config)) known.insert(name);
+    load_parameters(contents, file, known);
+    load_counts(contents, file);
+    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {});
+    if (!log_temperature.empty()) model.log_temperature.value = log_temperature;
+    const uint64_t state_dim = static_cast<uint64_t>(model.spec.state_dim);
+    model.state_mean = tensor_or_text(file, "state_mean", {state_dim});
+    model.state_std = tensor_or_text(file, "state_std", {state_dim});
+    if (model.state_mean.empty() != model.state_std.empty())
+        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
+             file.path.c_str());
+    if (model.state_mean.empty()) {
         if (settings.behaviour == "random")
             fail("import.normaliser",
                  "%s has no state_mean and state_std, and there is no data set to take them from; see --dataset",

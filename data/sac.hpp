@@ -15,17 +15,7 @@
 //   entropy_noise   step: update; index: row; site: action dimension of a ~ pi(s), plus action_dim of a' ~ pi(s')
 #pragma once
 
-#include <array>
-#include <cmath>
-#include <cstdint>
-#include <cstdio>
-#include <map>
-#include <string>
-#include <utility>
-#include <vector>
-
-#include "../memory.hpp"
-#include "../nn.hpp"
+#include "../memory.hpp"  // and with it nn.hpp and the standard headers
 #include "safetensors.hpp"
 #include "state.hpp"
 
@@ -536,11 +526,6 @@ inline void load_checkpoint(const std::string& path, Learner& learner, const std
     learner.visit(loader);
 }
 
-struct SavedPolicy {
-    Network<float> network;
-    std::map<std::string, std::string> metadata;  // task, physics, return, steps, ...
-};
-
 // Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256] (the means) and
 // last_fc_log_std.*: D4RL's names and PyTorch's layout. `parameters` may be const.
 template <class Parameters, class F>
@@ -556,32 +541,32 @@ void each_policy_tensor(Parameters& parameters, F&& f) {
         }
 }
 
-inline void save_policy(const std::string& path, const SavedPolicy& policy) {
+// metadata: the name, the return and so on.
+inline void save_policy(const std::string& path, const Network<float>& policy,
+                        const std::map<std::string, std::string>& metadata = {}) {
     TensorFile file;
-    file.metadata = policy.metadata;
+    file.metadata = metadata;
     file.metadata["nonlinearity"] = "relu";
     file.metadata["output_distribution"] = "tanh_gaussian";
-    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+    each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.add(name, shape, values);
     });
     write_safetensors(path, file);
 }
 
 // The policy that save_policy() wrote. Errors: sac.policy, safetensors.*
-inline SavedPolicy policy_of(const TensorFile& file) {
+inline Network<float> policy_of(const TensorFile& file) {
     const Shape first = file.find("fc0.weight").shape, last = file.find("last_fc.weight").shape;
     const auto too_large = [](uint64_t extent) { return extent < 1 || extent > 1 << 14; };
     if (first.size() != 2 || last.size() != 2 || too_large(first[0]) || too_large(first[1]) || too_large(last[0]))
         fail("sac.policy", "%s: fc0.weight %s and last_fc.weight %s are not those of a policy", file.path.c_str(),
              shape_text(first).c_str(), shape_text(last).c_str());
-    const int hidden = static_cast<int>(first[0]);
-    SavedPolicy policy = {{static_cast<int>(first[1]), hidden, static_cast<int>(2 * last[0]), 1, 0, 0}, file.metadata};
-    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+    Network<float> policy(static_cast<int>(first[1]), static_cast<int>(first[0]), static_cast<int>(2 * last[0]), 1, 0,
+                          0);
+    each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.read_into(values, name, shape);
     });
     return policy;
 }
-
-inline SavedPolicy load_policy(const std::string& path) { return policy_of(read_safetensors(path)); }
 
 }  // namespace sac

@@ -9,25 +9,15 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include <algorithm>
-#include <array>
 #include <bit>
 #include <cerrno>
 #include <charconv>
-#include <cstdint>
-#include <cstdio>
-#include <cstring>
-#include <map>
 #include <optional>
 #include <ranges>
 #include <span>
-#include <string>
 #include <string_view>
-#include <type_traits>
-#include <utility>
-#include <vector>
 
-#include "../nn.hpp"
+#include "../nn.hpp"  // and with it the other standard headers
 
 static_assert(std::endian::native == std::endian::little, "tensors are copied as they lie in memory");
 static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
@@ -435,8 +425,12 @@ struct HeaderReader {
         if (!take(c)) expected(std::string(1, c).c_str());
     }
 
-    // Returns \uXXXX as UTF-8. Surrogate pairs are refused: other programs write characters above U+FFFF as UTF-8.
-    std::string unicode_escape() {
+    // Returns what an escape stands for, as UTF-8. Surrogate pairs are refused: other programs write characters above
+    // U+FFFF as UTF-8.
+    std::string escape() {
+        const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
+        if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
+        if (which < 8) return {"\"\\/\b\f\n\r\t"[which]};
         uint32_t code = 0;
         const std::string_view digits = file.substr(at, 4);
         const char* end = digits.data() + digits.size();
@@ -455,13 +449,7 @@ struct HeaderReader {
             if (at >= file.size() || static_cast<uint8_t>(file[at]) < 0x20) expected("the end of a string");
             const char c = file[at++];
             if (c == '"') return out;
-            if (c != '\\') {
-                out += c;
-                continue;
-            }
-            const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
-            if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
-            out += which == 8 ? unicode_escape() : std::string(1, "\"\\/\b\f\n\r\t"[which]);
+            out += c == '\\' ? escape() : std::string(1, c);
         }
     }
     uint64_t integer() {
@@ -534,9 +522,8 @@ inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
 
 // Refuses holes, overlaps and a rest. Sorts the tensors by place: a header of another program may have any order.
 inline void check_layout(TensorFile& file) {
-    std::stable_sort(file.tensors.begin(), file.tensors.end(), [](const StoredTensor& a, const StoredTensor& b) {
-        return std::pair(a.begin, a.size) < std::pair(b.begin, b.size);  // an empty tensor before the one that follows
-    });
+    // By size too: an empty tensor comes before the one that follows it.
+    std::ranges::stable_sort(file.tensors, {}, [](const StoredTensor& t) { return std::pair(t.begin, t.size); });
     const size_t available = file.data().size();
     size_t next = 0;
     for (const StoredTensor& tensor : file.tensors) {

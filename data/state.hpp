@@ -29,8 +29,8 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
 // ---------------------------------------------------------------------------------------------------------------------
 // The replay buffer: trajectories laid end to end; returns are computed again.
 
-// Visits states [steps, state_dim], actions [steps, action_dim], rewards [steps], lengths and terminated [trajectories].
-// Errors: checkpoint.replay if the sizes do not fit together, and those of relabel().
+// Visits states [steps, state_dim], actions [steps, action_dim] and rewards [steps] of all trajectories, and each one's
+// length and end. Errors: checkpoint.replay if the sizes do not fit together; those of relabel().
 template <class Archive>
 void visit_replay(Archive& archive, ReplayBuffer& replay) {
     std::vector<float> states, actions, rewards;

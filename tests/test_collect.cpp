@@ -402,9 +402,9 @@ TEST(trainings_have_the_published_levels_and_sizes) {
 TEST(shipped_policies_have_the_published_returns) {
     Tape<float> tape(one_thread());
     for (const char* name : {"hopper", "walker2d", "halfcheetah", "ant"}) {
-        sac::SavedPolicy policy = embedded_policy(std::string(name) + "-medium");
+        sac::Network<float> policy = embedded_policy(std::string(name) + "-medium");
         LiveTask environment(task_of(name));
-        const Moments returns = sampled_returns(tape, policy.network, environment, test_seed(), data_set_episodes, 10);
+        const Moments returns = sampled_returns(tape, policy, environment, test_seed(), data_set_episodes, 10);
         const double level = medium_return(task_of(name));
         CHECK_CLOSE(returns.mean(), level, 0.1 * level + 3 * returns.deviation() / std::sqrt(returns.count));
     }
@@ -471,7 +471,7 @@ TEST(a_replay_set_has_d4rls_layout) {
     const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     const DataSetStatistics s = statistics_of(rows, trajectories);
     CHECK(s.left_out == 0 && s.jumps == 0 && s.repeated == 0);
-    const sac::SavedPolicy policy = sac::load_policy(path + ".policy.safetensors");
+    const sac::Network<float> policy = sac::policy_of(read_safetensors(path + ".policy.safetensors"));
     check_policy(policy, 11, 3);
     CHECK_FAILS("collect.policy", check_policy(policy, 17, 6));
 }
@@ -481,8 +481,8 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     const MujocoTask& task = task_of("ant");
     const std::string path = scratch / "ant_medium-v2.hdf5";
     const sac::Network<float> network(27, 256, 16, 0.1, test_seed(), 0);
-    collect_medium(path, task, 1200, {"test", test_seed()}, {network, {}}, [](size_t) {});
-    CHECK_FAILS("collect.policy", collect_medium(path, task_of("hopper"), 10, {"", 0}, {network, {}}, [](size_t) {}));
+    collect_medium(path, task, 1200, {"test", test_seed()}, network, [](size_t) {});
+    CHECK_FAILS("collect.policy", collect_medium(path, task_of("hopper"), 10, {"", 0}, network, [](size_t) {}));
     const Hdf5File file = open_hdf5(path);
     const Rows rows = read_rows(file);
     CHECK(rows.count == 1200 && rows.state_dim == 111);
@@ -574,7 +574,7 @@ TEST(a_collected_file_says_how_it_was_made_and_shows_its_progress) {
     collect("maze2d-umaze-v1", "new/folder/maze.hdf5");
     collect("hopper-medium-v2", "hopper.hdf5");
     const std::string policy = scratch / "policy.safetensors";
-    sac::save_policy(policy, {sac::Network<float>(11, 16, 6, 0.1, test_seed(), 0), {}});
+    sac::save_policy(policy, sac::Network<float>(11, 16, 6, 0.1, test_seed(), 0));
     collect("hopper-medium-v2", "other.hdf5", policy);
     CHECK(read_file(scratch / "hopper.hdf5") != read_file(scratch / "other.hdf5"));
     CHECK_FAILS("collect.task", collect("lunar-lander-v2", "x.hdf5"));

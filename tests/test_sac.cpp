@@ -628,7 +628,7 @@ TEST(sac_checkpoint_of_another_run_is_refused) {
     elsewhere.limit = 5;
     same.state[0] += 1;  // as if the environment went another way
     CHECK_FAILS("sac.resume", same.resume(elsewhere));
-    sac::save_policy(file.path, {learner.policy, {}});
+    sac::save_policy(file.path, learner.policy);
     CHECK_FAILS("safetensors.missing", sac::load_checkpoint(file.path, same, "task=line"));
 }
 
@@ -638,8 +638,8 @@ TEST(sac_checkpoint_of_another_run_is_refused) {
 TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     TemporaryFile file("policy");
     const sac::Network<float> network(11, 256, 6, 0.05, test_seed(), 0);
-    sac::save_policy(file.path,
-                     {network, {{"task", "hopper"}, {"physics", "d4rl"}, {"return", "1422.1"}, {"steps", "7"}}});
+    sac::save_policy(file.path, network,
+                     {{"task", "hopper"}, {"physics", "d4rl"}, {"return", "1422.1"}, {"steps", "7"}});
     const TensorFile raw = read_safetensors(file.path);
     CHECK_EQUAL(raw.tensors.size(), size_t{8});
     const std::vector<float> fc0 = raw.get<float>("fc0.weight", {256, 11}), fc1 = raw.get<float>("fc1.bias", {256});
@@ -651,11 +651,11 @@ TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     CHECK_EQUAL(raw.text("return"), "1422.1");
     CHECK_EQUAL(raw.text("output_distribution"), "tanh_gaussian");
 
-    sac::SavedPolicy loaded = sac::load_policy(file.path);
-    CHECK_EQUAL(loaded.metadata.at("task"), "hopper");
+    CHECK_EQUAL(raw.text("task"), "hopper");
+    sac::Network<float> loaded = sac::policy_of(raw);
     for (size_t i = 0; i < 6; ++i) {
-        CHECK(loaded.network.parameters[i].value == network.parameters[i].value);
-        CHECK(loaded.network.parameters[i].shape == network.parameters[i].shape);
+        CHECK(loaded.parameters[i].value == network.parameters[i].value);
+        CHECK(loaded.parameters[i].shape == network.parameters[i].shape);
     }
 
     // Mean and log standard deviation as a reader of the file would compute them.
@@ -664,7 +664,7 @@ TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     const std::vector<double> output = plain_forward(network, {state.begin(), state.end()});
     Tape<float> tape(one_thread());
     float action[3];
-    const float log_prob = sac::act(tape, loaded.network, state.data(), noise.data(), action);
+    const float log_prob = sac::act(tape, loaded, state.data(), noise.data(), action);
     double expected = 0;
     for (size_t j = 0; j < 3; ++j) {
         const double z = static_cast<double>(noise[j]), a = std::tanh(output[j] + std::exp(output[3 + j]) * z);
@@ -684,14 +684,14 @@ TEST(sac_policy_file_that_is_none_is_refused) {
     other.add("fc0.weight", {2}, std::vector<float>{1, 2});
     other.add("last_fc.weight", {1, 2}, std::vector<float>{1, 2});
     write_safetensors(file.path, other);
-    CHECK_FAILS("sac.policy", sac::load_policy(file.path));
+    CHECK_FAILS("sac.policy", sac::policy_of(read_safetensors(file.path)));
     write_safetensors(file.path, TensorFile{});
-    CHECK_FAILS("safetensors.missing", sac::load_policy(file.path));
-    sac::save_policy(file.path, {sac::Network<float>(2, 8, 4, 1, 0, 0), {}});
+    CHECK_FAILS("safetensors.missing", sac::policy_of(read_safetensors(file.path)));
+    sac::save_policy(file.path, sac::Network<float>(2, 8, 4, 1, 0, 0));
     std::string bytes = read_file(file.path);
     bytes[bytes.size() - 3] = static_cast<char>(bytes[bytes.size() - 3] ^ 1);
     write_file_atomic(file.path, bytes);
-    CHECK_FAILS("safetensors.checksum", sac::load_policy(file.path));
+    CHECK_FAILS("safetensors.checksum", sac::policy_of(read_safetensors(file.path)));
 }
 
 TEST(sac_played_episode_is_a_function_of_seed_and_number) {
