@@ -3,16 +3,12 @@
 // actor-critic run (sac.hpp) up to the published return of the medium set, and medium, the actions of the policy with
 // which such a run ended.
 //
-// In order: policies; training to a level; layouts; the families; the body of `wodtem collect`.
+// In order: policies; training to a level; the families of data sets; the body of `wodtem collect`.
 // Promises: a data set is a function of (task, steps, seed, policy, machine), however often its making was stopped; its
 // metadata say how it was made, so that nobody takes it for D4RL's. Leaves out: expert and random sets.
 #pragma once
 
-#include <chrono>
 #include <filesystem>
-#include <functional>
-#include <string>
-#include <vector>
 
 #include "antmaze.hpp"
 #include "console.hpp"
@@ -28,7 +24,6 @@ struct Watch {
     // phase: "collecting" or "training"; share: of the work that is done, in [0, 1]; numbers: a short text.
     std::function<void(const char* phase, double share, const std::string& numbers)> show = [](auto&&...) {};
     std::function<bool()> stop = [] { return false; };
-    double checkpoint_every = 60;  // seconds
 };
 
 #ifdef WODTEM_MUJOCO
@@ -43,25 +38,25 @@ WODTEM_EMBED(wodtem_ant_medium, "data/policies/ant-medium.safetensors")
 WODTEM_EMBED(wodtem_antmaze_walker, "data/policies/antmaze-walker.safetensors")
 
 // A policy that this program holds: "hopper-medium" and so on, or "antmaze-walker". Errors: collect.policy.
-inline sac::SavedPolicy embedded_policy(const std::string& name) {
-    struct Embedded {
-        const char *name, *begin, *end;
-    };
-    for (const Embedded& one : {Embedded{"hopper-medium", wodtem_hopper_medium, wodtem_hopper_medium_end},
-                                {"walker2d-medium", wodtem_walker2d_medium, wodtem_walker2d_medium_end},
-                                {"halfcheetah-medium", wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end},
-                                {"ant-medium", wodtem_ant_medium, wodtem_ant_medium_end},
-                                {walker_name, wodtem_antmaze_walker, wodtem_antmaze_walker_end}})
-        if (name == one.name)
-            return sac::policy_of(parse_safetensors(std::string(one.begin, one.end), "the policy " + name));
-    fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
+inline sac::Network<float> embedded_policy(const std::string& name) {
+    const std::map<std::string, std::pair<const char*, const char*>> embedded = {
+        // begin and end
+        {"hopper-medium", {wodtem_hopper_medium, wodtem_hopper_medium_end}},
+        {"walker2d-medium", {wodtem_walker2d_medium, wodtem_walker2d_medium_end}},
+        {"halfcheetah-medium", {wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end}},
+        {"ant-medium", {wodtem_ant_medium, wodtem_ant_medium_end}},
+        {walker_name, {wodtem_antmaze_walker, wodtem_antmaze_walker_end}}};
+    if (!embedded.contains(name))
+        fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
+    const auto [begin, end] = embedded.at(name);
+    return sac::policy_of(parse_safetensors(std::string(begin, end), "the policy " + name));
 }
 
 // A policy must fit the task's states and actions. Errors: collect.policy.
-inline void check_policy(const sac::SavedPolicy& policy, int inputs, int actions) {
-    if (policy.network.inputs() != inputs || policy.network.outputs() != 2 * actions)
+inline void check_policy(const sac::Network<float>& policy, int inputs, int actions) {
+    if (policy.inputs() != inputs || policy.outputs() != 2 * actions)
         fail("collect.policy", "the policy has %d inputs and %d actions, expected %d and %d; give this task's policy",
-             policy.network.inputs(), policy.network.outputs() / 2, inputs, actions);
+             policy.inputs(), policy.outputs() / 2, inputs, actions);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -70,12 +65,17 @@ inline void check_policy(const sac::SavedPolicy& policy, int inputs, int actions
 // How many entries of the observation a network sees, from the first on: ant's others (contact forces) are always 0.
 inline int live_columns(const MujocoTask& task) { return task.rules == Rules::ant ? 27 : task.state_dim; }
 
-// A gym task whose states are its live columns alone.
+// A gym task whose states are its live columns alone. While `recording` it keeps the rows of the present episode as
+// D4RL's files have them; after an error the last row is not complete, and the episode must be dropped.
+// T: see CollectedRows.
+template <class T = float>
 struct LiveTask : Environment {
     MujocoEnvironment body;
-    std::vector<float> all;  // [task.state_dim] scratch
+    bool recording = true;
+    CollectedRows<T> rows = {};
+    std::vector<float> whole_state;  // [task.state_dim] scratch
 
-    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl), all(task.state_dim) {}
+    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl), whole_state(task.state_dim) {}
 
     EnvironmentSpec spec() const override {
         EnvironmentSpec spec = body.spec();
@@ -83,34 +83,19 @@ struct LiveTask : Environment {
         return spec;
     }
     void reset(const Random& random, uint64_t episode, float* state) override {
-        body.reset(random, episode, all.data());
-        std::copy_n(all.begin(), live_columns(*body.task), state);
-    }
-    Step step(const float* action, float* state) override {
-        const Step result = body.step(action, all.data());
-        std::copy_n(all.begin(), live_columns(*body.task), state);
-        return result;
-    }
-    std::unique_ptr<Environment> clone() const override { return std::make_unique<LiveTask>(*this); }
-};
-
-// The same, recording the rows of the present episode as D4RL's files have them. After an error the last row is not
-// complete, and the episode must be dropped. T: see CollectedRows.
-template <class T>
-struct RecordingTask : LiveTask {
-    CollectedRows<T> rows;
-
-    using LiveTask::LiveTask;
-
-    void reset(const Random& random, uint64_t episode, float* state) override {
         rows = {};
-        LiveTask::reset(random, episode, state);
+        body.reset(random, episode, whole_state.data());
+        std::copy_n(whole_state.begin(), live_columns(*body.task), state);
     }
     Step step(const float* action, float* state) override {
-        append_all(rows.observations, body.observation);
-        append_all(rows.qpos, std::span(body.data->qpos, body.model->nq));
-        append_all(rows.qvel, std::span(body.data->qvel, body.model->nv));
-        const Step result = LiveTask::step(action, state);
+        if (recording) {
+            append_all(rows.observations, body.observation);
+            append_all(rows.qpos, std::span(body.data->qpos, body.model->nq));
+            append_all(rows.qvel, std::span(body.data->qvel, body.model->nv));
+        }
+        const Step result = body.step(action, whole_state.data());
+        std::copy_n(whole_state.begin(), live_columns(*body.task), state);
+        if (!recording) return result;
         append_all(rows.next_observations, body.observation);
         append_all(rows.actions, std::span(action, body.task->action_dim));
         rows.rewards.push_back(static_cast<T>(result.reward));
@@ -120,7 +105,7 @@ struct RecordingTask : LiveTask {
         rows.terminals.push_back(result.terminated && !timeout);
         return result;
     }
-    std::unique_ptr<Environment> clone() const override { return std::make_unique<RecordingTask>(*this); }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<LiveTask>(*this); }
 };
 
 // A run ends at the first evaluation whose mean return is within `tolerance` times the level of the level.
@@ -131,7 +116,6 @@ struct Training {
     double tolerance = 0.05;
     uint64_t evaluate_every = 5000;  // updates
     int episodes = 40;               // of an evaluation, with sampled actions, as in a medium set
-    int threads = 1;                 // of the learner; its results do not depend on them
 };
 
 // Training for a gym task's medium policy and its replay set of `rows` rows. D4RL's runs made as many updates as steps;
@@ -159,16 +143,16 @@ inline Training walker_training(uint32_t seed) {
 // Undiscounted returns of episodes with sampled actions. Episodes in which the simulation breaks down do not count.
 inline Moments sampled_returns(Tape<float>& tape, sac::Network<float>& policy, Environment& environment, uint32_t seed,
                                uint64_t first_episode, int episodes) {
-    sac::Actor actor{tape, policy, seed};
     Moments returns;
     for (int i = 0; i < episodes; ++i) {
-        const Episode episode = actor.play(environment, first_episode + i);
+        const Episode episode = sac::play_sampled(tape, policy, environment, seed, first_episode + i);
         if (episode.error.empty()) returns.add(episode.total_reward);
     }
     return returns;
 }
 
 constexpr uint64_t training_evaluations = uint64_t{1} << 40;  // the numbers of their episodes, the same at each
+constexpr double checkpoint_interval = 60;                    // seconds
 
 // Whether the learner's policy is at the level: a quarter of the episodes must come within four times the tolerance,
 // then the whole number within the tolerance. `returns`: of the evaluation that decided.
@@ -183,7 +167,7 @@ inline bool is_at_level(sac::Learner& learner, Environment& environment, const T
 }
 
 // Trains until is_at_level() after a multiple of `evaluate_every` updates, and returns the returns found there. Begins
-// from the checkpoint if there is one; saves one when `watch` stops it, every checkpoint_every seconds, and at the end.
+// from the checkpoint if there is one; saves one when `watch` stops it, every checkpoint_interval, and at the end.
 // Errors: collect.stopped, and those of sac.hpp.
 inline Moments train_to_level(sac::Learner& learner, Environment& environment, const Training& training,
                               const std::string& checkpoint, const Watch& watch) {
@@ -218,7 +202,7 @@ inline Moments train_to_level(sac::Learner& learner, Environment& environment, c
             std::snprintf(numbers + used, sizeof numbers - used, ", return %.0f of %.0f", returns.mean(),
                           training.level);
         watch.show("training", std::clamp(best / training.level, 0.0, 0.99), numbers);
-        if (!stop && seconds_since(saved) <= watch.checkpoint_every) continue;
+        if (!stop && seconds_since(saved) <= checkpoint_interval) continue;
         sac::save_checkpoint(checkpoint, learner, training.name);
         saved = Clock::now();
         if (stop)
@@ -230,25 +214,29 @@ inline Moments train_to_level(sac::Learner& learner, Environment& environment, c
     return returns;
 }
 
-inline void save_trained_policy(const std::string& path, const sac::Learner& learner, const Training& training,
-                                const Moments& returns) {
+// Trains a policy, or goes on with its training, and writes it to `path`. Errors: those of train_to_level().
+inline sac::Learner train_policy(Environment& environment, const Training& training, Compute& compute,
+                                 const std::string& path, const std::string& checkpoint, const Watch& watch) {
+    sac::Learner learner(training.settings, environment.spec(), compute);
+    const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
     const auto number = [](double x) {
         char text[40];
         std::snprintf(text, sizeof text, "%.2f", x);
         return std::string(text);
     };
-    sac::save_policy(path, {learner.policy,
-                            {{"name", training.name},
-                             {"physics", "d4rl"},
-                             {"return", number(returns.mean())},
-                             {"return_deviation", number(returns.deviation())},
-                             {"seed", std::to_string(training.settings.seed)},
-                             {"steps", std::to_string(learner.progress.steps)},
-                             {"updates", std::to_string(learner.progress.updates)}}});
+    sac::save_policy(path, learner.policy,
+                     {{"name", training.name},
+                      {"physics", "d4rl"},
+                      {"return", number(returns.mean())},
+                      {"return_deviation", number(returns.deviation())},
+                      {"seed", std::to_string(training.settings.seed)},
+                      {"steps", std::to_string(learner.progress.steps)},
+                      {"updates", std::to_string(learner.progress.updates)}});
+    return learner;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Layouts.
+// The families of data sets.
 
 // What a collected file says of itself.
 struct Origin {
@@ -256,90 +244,61 @@ struct Origin {
     uint32_t seed;
 };
 
-inline void write_origin(Hdf5Writer& file, const Origin& origin) {
-    file.text("metadata/made_by", origin.command);
-    file.text("metadata/note", "a stand-in made by wodtem, not D4RL's data");
-    file.text("metadata/mujoco", mujoco_version());
-    file.add("metadata/seed", {1}, std::array{static_cast<int32_t>(origin.seed)});
-}
-
-// Writes the first `steps` rows.
+// Writes the first `steps` rows; add(file) writes what a family has beside them. The arrays are those of D4RL's layout:
+// eight for the mazes, terminals as booleans in maze2d and as numbers in antmaze; for the gym tasks see CollectedRows.
 template <class T>
-void write_rows(Hdf5Writer& file, const CollectedRows<T>& rows, size_t steps) {
+void write_set(const std::string& path, const CollectedRows<T>& rows, size_t steps, const Origin& origin,
+               const std::function<void(Hdf5Writer&)>& add = {}) {
+    Hdf5Writer file(path);
     rows.each_array([&](const char* name, auto array, bool is_table) {
         const auto& values = rows.*array;
         if (values.empty()) return;
         const size_t width = values.size() / rows.length();
         file.add(name, is_table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
     });
-}
-
-// ---------------------------------------------------------------------------------------------------------------------
-// The families.
-
-inline void write_maze_set(const std::string& path, const CollectedRows<float>& rows, const Origin& origin) {
-    Hdf5Writer file(path);
-    write_rows(file, rows, rows.length());
-    write_origin(file, origin);
+    if (add) add(file);
+    file.text("metadata/made_by", origin.command);
+    file.text("metadata/note", "a stand-in made by wodtem, not D4RL's data");
+    file.text("metadata/mujoco", mujoco_version());
+    file.add("metadata/seed", {1}, std::array{static_cast<int32_t>(origin.seed)});
     file.close();
 }
 
-// D4RL's layout of maze2d: eight arrays of N rows, the flags as booleans. `progress`: see collect_maze_data_set.
-inline void collect_maze2d(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                           const std::function<void(size_t)>& progress) {
-    write_maze_set(path, collect_maze_data_set(task, steps, origin.seed, progress), origin);
-}
-
-// D4RL's layout of antmaze: the same eight names, terminals as numbers. Errors: collect.policy.
-inline void collect_antmaze(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                            sac::SavedPolicy walker, const std::function<void(size_t)>& progress) {
-    check_policy(walker, walking_ant_state, task.action_dim);
-    write_maze_set(path, collect_ant_maze_set(task, steps, origin.seed, walker.network, progress), origin);
-}
-
 // D4RL's metadata/policy, for states of state_dim numbers; inputs that the policy does not have get weights of 0.
-inline void write_policy(Hdf5Writer& file, const sac::SavedPolicy& policy, size_t state_dim) {
+inline void write_policy(Hdf5Writer& file, sac::Network<float> policy, size_t state_dim) {
     file.text("metadata/policy/nonlinearity", "relu");
     file.text("metadata/policy/output_distribution", "tanh_gaussian");
-    const auto add = [&](std::string name, Shape shape, std::span<const float> values) {
-        std::vector<float> widened;
-        if (name == "fc0.weight") {
-            const size_t seen = shape[1];
-            widened.resize(shape[0] * state_dim);
-            for (size_t unit = 0; unit < shape[0]; ++unit)
-                std::copy_n(&values[unit * seen], seen, &widened[unit * state_dim]);
-            shape[1] = state_dim;
-            values = widened;
-        }
+    Parameter<float>& first = policy.parameters[0];
+    const size_t seen = std::exchange(first.shape[1], state_dim);
+    for (size_t unit = 0; unit < first.shape[0]; ++unit)
+        first.value.insert(first.value.begin() + static_cast<ptrdiff_t>(unit * state_dim + seen), state_dim - seen, 0);
+    sac::each_policy_tensor(policy.parameters, [&](std::string name, const Shape& shape, auto values) {
         std::replace(name.begin(), name.end(), '.', '/');
         file.add("metadata/policy/" + name, shape, values);
-    };
-    sac::each_policy_tensor(policy.network.parameters, add);
+    });
 }
 
 // The first `steps` rows of whole episodes of sampled actions. An episode in which the simulation breaks down is left
 // out. `progress` gets the number of rows after every episode. Errors: collect.policy.
 inline void collect_medium(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                           sac::SavedPolicy policy, const std::function<void(size_t)>& progress) {
+                           sac::Network<float> policy, const std::function<void(size_t)>& progress) {
     check_policy(policy, live_columns(task), task.action_dim);
-    RecordingTask<float> environment(task);
+    LiveTask environment(task);
     Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
-    sac::Actor actor{tape, policy.network, origin.seed};
     CollectedRows<float> set;
     for (uint64_t number = data_set_episodes; set.length() < steps; ++number) {
-        const Episode episode = actor.play(environment, number);
+        std::vector<float> log_probs;
+        const Episode episode = sac::play_sampled(tape, policy, environment, origin.seed, number, &log_probs);
         if (!episode.error.empty()) continue;
-        environment.rows.log_probs = actor.log_probs;
+        environment.rows.log_probs = std::move(log_probs);
         set.append(environment.rows);
         progress(set.length());
     }
-    Hdf5Writer file(path);
-    write_rows(file, set, steps);
-    file.text("metadata/algorithm", "SAC");
-    write_policy(file, policy, task.state_dim);
-    write_origin(file, origin);
-    file.close();
+    write_set(path, set, steps, origin, [&](Hdf5Writer& file) {
+        file.text("metadata/algorithm", "SAC");
+        write_policy(file, policy, task.state_dim);
+    });
 }
 
 // The last `steps` rows of a run's replay, which itself holds single precision, neither qpos nor qvel, and live columns
@@ -348,7 +307,7 @@ inline void collect_medium(const std::string& path, const MujocoTask& task, size
 inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTask& task, size_t steps) {
     const sac::Replay& replay = learner.replay;
     const auto episode_of = [&](uint64_t back) { return replay.episode(replay.recent(back)); };
-    RecordingTask<double> environment(task);
+    LiveTask<double> environment(task);
     CollectedRows<double>& rows = environment.rows;
     CollectedRows<double> set;
     std::vector<float> state(replay.state_dim);
@@ -358,10 +317,8 @@ inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTa
         const size_t row = replay.recent(back);
         if (back == first || episode_of(back) != episode_of(back + 1))
             environment.reset({learner.settings.seed, Stream::environment}, episode_of(back), state.data());
-        if (back <= steps)
-            environment.step(replay.action(row), state.data());
-        else
-            environment.LiveTask::step(replay.action(row), state.data());  // not recorded
+        environment.recording = back <= steps;
+        environment.step(replay.action(row), state.data());
         if (!std::equal(state.begin(), state.end(), replay.next_state(row)))
             fail("collect.replay", "episode %llu went another way when it was played again",
                  static_cast<unsigned long long>(episode_of(back)));
@@ -377,30 +334,18 @@ inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTa
 // the level is reached before the replay has `steps` rows, the final policy makes the rest.
 // Errors: collect.stopped, collect.replay.
 inline void collect_medium_replay(const std::string& path, const MujocoTask& task, size_t steps, const Origin& origin,
-                                  const Training& training, const std::string& checkpoint, const Watch& watch) {
+                                  const Training& training, Compute& compute, const std::string& checkpoint,
+                                  const Watch& watch) {
     LiveTask environment(task);
-    Compute compute(best_kernel(), training.threads);
-    sac::Learner learner(training.settings, environment.spec(), compute);
-    const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
-    save_trained_policy(path + ".policy.safetensors", learner, training, returns);
+    environment.recording = false;
+    sac::Learner learner =
+        train_policy(environment, training, compute, path + ".policy.safetensors", checkpoint, watch);
     while (learner.replay.size() < steps) learner.interact(environment);
-    Hdf5Writer file(path);
-    write_rows(file, retrace(learner, task, steps), steps);
-    file.text("metadata/algorithm", "SAC");
-    // D4RL's number of the checkpoint, which counts rlkit's epochs of 1000 updates.
-    file.add("metadata/iteration", {1}, std::array{static_cast<int32_t>(learner.progress.updates / 1000)});
-    write_origin(file, origin);
-    file.close();
-}
-
-// Trains the policy of antmaze's walker in the same way.
-inline void train_walker(const std::string& path, const Training& training, const std::string& checkpoint,
-                         const Watch& watch) {
-    WalkingAnt environment;
-    Compute compute(best_kernel(), training.threads);
-    sac::Learner learner(training.settings, environment.spec(), compute);
-    const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
-    save_trained_policy(path, learner, training, returns);
+    write_set(path, retrace(learner, task, steps), steps, origin, [&](Hdf5Writer& file) {
+        file.text("metadata/algorithm", "SAC");
+        // D4RL's number of the checkpoint, which counts rlkit's epochs of 1000 updates.
+        file.add("metadata/iteration", {1}, std::array{static_cast<int32_t>(learner.progress.updates / 1000)});
+    });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -431,7 +376,7 @@ inline void collect_data_set_file(const std::string& id, const std::string& path
     const MujocoTask* task = find_mujoco_task(id);
     if (!task && id != walker_name) fail("collect.task", "no task of this program has data sets named %s", id.c_str());
     const auto policy = [&](const std::string& name) {
-        return policy_path.empty() ? embedded_policy(name) : sac::load_policy(policy_path);
+        return policy_path.empty() ? embedded_policy(name) : sac::policy_of(read_safetensors(policy_path));
     };
     const auto show = [&](size_t rows) {
         const size_t done = std::min(rows, steps);
@@ -439,20 +384,21 @@ inline void collect_data_set_file(const std::string& id, const std::string& path
     };
     if (const auto folder = std::filesystem::path(path).parent_path(); !folder.empty())
         make_folder(folder, "collect.folder");
-    if (id == walker_name) {
-        Training training = walker_training(seed);
-        training.threads = threads;
-        train_in_folder(path, [&](const std::string& checkpoint) { train_walker(path, training, checkpoint, watch); });
-    } else if (id.find("-medium-replay") != std::string::npos) {
-        Training training = gym_training(*task, seed, steps);
-        training.threads = threads;
+    if (id == walker_name || id.find("-medium-replay") != std::string::npos) {
         train_in_folder(path, [&](const std::string& checkpoint) {
-            collect_medium_replay(path, *task, steps, origin, training, checkpoint, watch);
+            Compute compute(best_kernel(), threads);
+            if (id != walker_name)
+                return collect_medium_replay(path, *task, steps, origin, gym_training(*task, seed, steps), compute,
+                                             checkpoint, watch);
+            WalkingAnt environment;
+            train_policy(environment, walker_training(seed), compute, path, checkpoint, watch);
         });
     } else if (task->rules == Rules::maze2d) {
-        collect_maze2d(path, *task, steps, origin, show);
+        write_set(path, collect_maze_data_set(*task, steps, seed, show), steps, origin);
     } else if (task->rules == Rules::antmaze) {
-        collect_antmaze(path, *task, steps, origin, policy(walker_name), show);
+        sac::Network<float> walker = policy(walker_name);
+        check_policy(walker, walking_ant_state, task->action_dim);
+        write_set(path, collect_ant_maze_set(*task, steps, seed, walker, show), steps, origin);
     } else {
         collect_medium(path, *task, steps, origin, policy(std::string(task->name) + "-medium"), show);
     }

@@ -9,18 +9,10 @@
 // and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
 #pragma once
 
-#include <algorithm>
-#include <charconv>
-#include <cmath>
-#include <cstdint>
 #include <filesystem>
-#include <set>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "safetensors.hpp"
-#include "settings.hpp"
+#include "settings.hpp"  // and with it the other standard headers
 
 // Where the contents of a model file lie in memory; reading writes to these places.
 struct ModelContents {
@@ -32,16 +24,16 @@ struct ModelContents {
     uint64_t updates = 0, interactions = 0;
 };
 
-inline void add_parameters(TensorFile& file, const ModelContents& model) {
+// What model files and files for ODT's code have in common: the metadata and the network's parameters.
+inline TensorFile network_file(const ModelContents& model, const char* format) {
+    TensorFile file;
+    file.metadata = {{"format", format},
+                     {"settings", settings_text(model.settings)},
+                     {"updates", std::to_string(model.updates)},
+                     {"interactions", std::to_string(model.interactions)}};
     for (const Parameter<float>& parameter : model.parameters)
         file.add(parameter.name, parameter.shape, parameter.value);
-}
-
-inline void add_metadata(TensorFile& file, const ModelContents& model, const std::string& format) {
-    file.metadata["format"] = format;
-    file.metadata["settings"] = settings_text(model.settings);
-    file.metadata["updates"] = std::to_string(model.updates);
-    file.metadata["interactions"] = std::to_string(model.interactions);
+    return file;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -49,11 +41,10 @@ inline void add_metadata(TensorFile& file, const ModelContents& model, const std
 
 inline constexpr const char* model_format = "wodtem model 1";
 
+// Errors: file.write.
 inline void save_model(const ModelContents& model, const std::string& path) {
-    TensorFile file;
-    add_metadata(file, model, model_format);
-    add_parameters(file, model);
-    file.add(model.log_temperature.name, {}, model.log_temperature.value);
+    TensorFile file = network_file(model, model_format);
+    file.add("log_temperature", {}, model.log_temperature.value);
     file.add("state_mean", {model.state_mean.size()}, model.state_mean);
     file.add("state_std", {model.state_std.size()}, model.state_std);
     write_safetensors(path, file);
@@ -66,10 +57,9 @@ inline std::string some_names(const std::vector<std::string>& names) {
     return text + (names.size() > 8 ? " and " + std::to_string(names.size() - 8) + " more" : "");
 }
 
-// Demands that the file has the network's tensors, and no others but those of `optional`.
-// Errors: model.names names the missing and the unknown ones.
-inline void require_names(const TensorFile& file, const ModelContents& model, const std::set<std::string>& optional) {
-    std::set<std::string> known = optional;
+// Reads the parameters. Beside them the file may have the tensors `known`, and no others.
+// Errors: model.names names the missing and the unknown ones; those of read_into() for a wrong shape or dtype.
+inline void load_parameters(ModelContents& model, const TensorFile& file, std::set<std::string> known) {
     std::vector<std::string> missing, unknown;
     for (const Parameter<float>& parameter : model.parameters) {
         known.insert(parameter.name);
@@ -77,15 +67,11 @@ inline void require_names(const TensorFile& file, const ModelContents& model, co
     }
     for (const StoredTensor& tensor : file.tensors)
         if (!known.contains(tensor.name)) unknown.push_back(tensor.name);
-    if (missing.empty() && unknown.empty()) return;
-    fail("model.names",
-         "%s: does not hold the network of its settings: %s%s%s%s; are layers, position and method right?",
-         file.path.c_str(), missing.empty() ? "" : "missing ", some_names(missing).c_str(),
-         unknown.empty() ? "" : (missing.empty() ? "unknown " : "; unknown "), some_names(unknown).c_str());
-}
-
-// Errors: those of TensorFile::read_into, for a shape or dtype that is not the network's.
-inline void load_parameters(ModelContents& model, const TensorFile& file) {
+    if (!missing.empty() || !unknown.empty())
+        fail("model.names",
+             "%s: does not hold the network of its settings: %s%s%s%s; are layers, position and method right?",
+             file.path.c_str(), missing.empty() ? "" : "missing ", some_names(missing).c_str(),
+             unknown.empty() ? "" : (missing.empty() ? "unknown " : "; unknown "), some_names(unknown).c_str());
     for (Parameter<float>& parameter : model.parameters)
         file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
 }
@@ -123,8 +109,7 @@ inline void load_counts(ModelContents& model, const TensorFile& file) {
 // Reads what save_model() wrote. Errors: model.names, model.value, import.metadata, safetensors.*.
 inline void load_model(ModelContents& model, const TensorFile& file) {
     const uint64_t state_dim = static_cast<uint64_t>(model.config.state_dim);
-    require_names(file, model, {"log_temperature", "state_mean", "state_std"});
-    load_parameters(model, file);
+    load_parameters(model, file, {"log_temperature", "state_mean", "state_std"});
     file.read_into(std::span(model.log_temperature.value), "log_temperature", {});
     model.state_mean = file.get<float>("state_mean", {state_dim});
     model.state_std = file.get<float>("state_std", {state_dim});
@@ -144,18 +129,17 @@ inline void require_room(const TensorFile& file, const Settings& settings) {
              file.path.c_str(), static_cast<long long>(weights));
 }
 
-// `given`: a model file, or a run's folder.
+// Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
 inline std::string model_path(const std::string& given) {
     return std::filesystem::is_directory(given) ? given + "/model.safetensors" : given;
 }
 
 // Errors: model.format, model.settings, safetensors.*, file.*.
 inline TensorFile open_model(const std::string& given) {
-    const std::string path = model_path(given);
-    TensorFile file = read_safetensors(path);
-    const auto format = file.metadata.find("format");
-    if (format == file.metadata.end() || format->second != model_format)
-        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written", path.c_str());
+    TensorFile file = read_safetensors(model_path(given));
+    if (!file.metadata.contains("format") || file.text("format") != model_format)
+        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written",
+             file.path.c_str());
     require_room(file, settings_in(file));
     return file;
 }
@@ -175,18 +159,13 @@ inline void load_first_weights(ModelContents& model, const TensorFile& file) {
 // ---------------------------------------------------------------------------------------------------------------------
 // ODT's state_dict.
 
-struct UnusedTensor {
-    std::string name;
-    Shape shape;
-};
-
-// ODT's code: GPT-2's vocabulary of one word; max_ep_len 1000; causal masks for n_positions 1024; heads for state and
-// return, which no loss reads.
-inline std::vector<UnusedTensor> unused_odt_tensors(const TransformerConfig& config) {
+// The names and shapes of the tensors that ODT's code saves and this program does not use: GPT-2's vocabulary of one
+// word; max_ep_len 1000; causal masks for n_positions 1024; heads for state and return, which no loss reads.
+inline std::vector<std::pair<std::string, Shape>> unused_odt_tensors(const TransformerConfig& config) {
     const uint64_t d = static_cast<uint64_t>(config.width), S = static_cast<uint64_t>(config.state_dim);
-    std::vector<UnusedTensor> unused = {{"transformer.wte.weight", {1, d}}, {"embed_timestep.weight", {1000, d}},
-                                        {"predict_state.weight", {S, d}},   {"predict_state.bias", {S}},
-                                        {"predict_return.weight", {1, d}},  {"predict_return.bias", {1}}};
+    std::vector<std::pair<std::string, Shape>> unused = {
+        {"transformer.wte.weight", {1, d}}, {"embed_timestep.weight", {1000, d}}, {"predict_state.weight", {S, d}},
+        {"predict_state.bias", {S}},        {"predict_return.weight", {1, d}},    {"predict_return.bias", {1}}};
     for (int layer = 0; layer < config.layers; ++layer) {
         const std::string attention = "transformer.h." + std::to_string(layer) + ".attn.";
         unused.push_back({attention + "bias", {1, 1, 1024, 1024}});
@@ -195,74 +174,23 @@ inline std::vector<UnusedTensor> unused_odt_tensors(const TransformerConfig& con
     return unused;
 }
 
-inline std::string numbers_text(const std::vector<float>& values) {
-    std::string text;
-    for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
-    return text;
-}
-
-inline void add_unused(TensorFile& file, const UnusedTensor& unused) {
-    size_t size = 1;
-    for (const uint64_t extent : unused.shape) size *= extent;
-    if (unused.name.ends_with(".attn.bias")) {
-        std::vector<uint8_t> causal_mask(size);  // [1, 1, query, key]
-        for (size_t i = 0; i < size; ++i) causal_mask[i] = i % 1024 <= i / 1024;
-        file.add(unused.name, unused.shape, causal_mask);
-    } else {
-        const float value = unused.name.ends_with(".masked_bias") ? -1e4f : 0.0f;
-        file.add(unused.name, unused.shape, std::vector<float>(size, value));
-    }
-}
-
-// Everything that a strict load_state_dict of ODT's model expects, and nothing else.
-inline TensorFile odt_file(const ModelContents& model) {
-    TensorFile file;
-    add_metadata(file, model, "ODT state_dict");
-    file.metadata["log_temperature"] = numbers_text(model.log_temperature.value);
-    file.metadata["state_mean"] = numbers_text(model.state_mean);
-    file.metadata["state_std"] = numbers_text(model.state_std);
-    add_parameters(file, model);
-    for (const UnusedTensor& unused : unused_odt_tensors(model.config)) add_unused(file, unused);
-    return file;
-}
-
 // The numbers of a tensor, or of the metadata entry of its name, where they are separated by spaces; nothing if the
 // file has neither. Errors: import.metadata.
-inline std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape,
-                                         size_t size) {
+inline std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape) {
+    const size_t size = shape.empty() ? 1 : shape[0];
     if (file.has(name)) return file.get<float>(name, shape);
     if (!file.metadata.contains(name)) return {};
     std::vector<float> values;
+    bool finite = true;
     for (const std::string& word : split(file.text(name), ' ')) {
-        float value = NAN;
-        const char* end = word.data() + word.size();
-        if (std::from_chars(word.data(), end, value).ptr != end) value = NAN;
-        values.push_back(value);
+        const char* const end = word.data() + word.size();
+        float& value = values.emplace_back(NAN);
+        finite = finite && std::from_chars(word.data(), end, value).ptr == end && std::isfinite(value);
     }
-    const auto finite = [](float x) { return std::isfinite(x); };
-    if (values.size() != size || !std::all_of(values.begin(), values.end(), finite))
+    if (!finite || values.size() != size)
         fail("import.metadata", "%s: metadata entry %s is not %zu finite number%s separated by spaces",
              file.path.c_str(), name.c_str(), size, size == 1 ? "" : "s");
     return values;
-}
-
-// Reads a file from ODT's code or from odt_file(). Returns whether the file has the statistics of the states; without
-// them the caller must find them elsewhere, and then call check_model(). Errors: model.names, import.metadata.
-inline bool load_odt(ModelContents& model, const TensorFile& file) {
-    std::set<std::string> optional = {"log_temperature", "state_mean", "state_std"};
-    for (const UnusedTensor& unused : unused_odt_tensors(model.config)) optional.insert(unused.name);
-    require_names(file, model, optional);
-    load_parameters(model, file);
-    load_counts(model, file);
-    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {}, 1);
-    if (!log_temperature.empty()) model.log_temperature.value = log_temperature;
-    const size_t state_dim = static_cast<size_t>(model.config.state_dim);
-    model.state_mean = tensor_or_text(file, "state_mean", {state_dim}, state_dim);
-    model.state_std = tensor_or_text(file, "state_std", {state_dim}, state_dim);
-    if (model.state_mean.empty() != model.state_std.empty())
-        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
-             file.path.c_str());
-    return !model.state_mean.empty();
 }
 
 // A model in memory that neither trains nor acts.
@@ -279,28 +207,58 @@ struct StoredModel {
     }
 };
 
-// The command `export --odt`: from a model file (or run folder) to `out`.
+// The command `export --odt`: from a model file (or run folder) to `out`, which gets everything that a strict
+// load_state_dict of ODT's model expects, and nothing else. What it has no place for is text in the metadata.
+// Errors: those of open_model() and load_model(), file.write.
 inline void export_odt(const std::string& given, const std::string& out) {
     const TensorFile file = open_model(given);
     StoredModel model{settings_in(file)};
     ModelContents contents = model.contents();
     load_model(contents, file);
-    const TensorFile exported = odt_file(contents);
+    TensorFile exported = network_file(contents, "ODT state_dict");
+    const auto set_text = [&](const char* name, const std::vector<float>& values) {
+        std::string& text = exported.metadata[name];
+        for (const float value : values) text += (text.empty() ? "" : " ") + number_text(value);
+    };
+    set_text("log_temperature", model.log_temperature.value);
+    set_text("state_mean", model.state_mean);
+    set_text("state_std", model.state_std);
+    std::vector<uint8_t> causal_mask(1024 * 1024);  // [query, key]
+    for (size_t i = 0; i < causal_mask.size(); ++i) causal_mask[i] = i % 1024 <= i / 1024;
+    for (const auto& [name, shape] : unused_odt_tensors(model.network.config)) {
+        const float value = name.ends_with(".masked_bias") ? -1e4f : 0.0f;
+        if (name.ends_with(".attn.bias"))
+            exported.add(name, shape, causal_mask);
+        else
+            exported.add(name, shape, std::vector<float>(*byte_size(shape, DType::F32) / sizeof value, value));
+    }
     write_safetensors(out, exported);
     std::printf(
         "%s: %zu tensors for a strict load_state_dict of ODT's model%s\n", out.c_str(), exported.tensors.size(),
         model.spec.discrete_actions > 0 ? ", were there not predict_action.logits: ODT has no discrete actions" : "");
 }
 
-// The command `import`: from a file under ODT's names to a model file. find_statistics(model) is called if the file has
-// none of the states. Errors: model.*, import.*, safetensors.*.
+// The command `import`: from a file of ODT's code or of export_odt() to a model file. find_statistics(model) is called
+// if the file has none of the states. Errors: model.*, import.*, safetensors.*.
 template <class FindStatistics>
 void import_odt(const TensorFile& file, const Settings& settings, const std::string& out,
                 FindStatistics&& find_statistics) {
     require_room(file, settings);
     StoredModel model{settings};
     ModelContents contents = model.contents();
-    if (!load_odt(contents, file)) {
+    std::set<std::string> known = {"log_temperature", "state_mean", "state_std"};
+    for (const auto& [name, shape] : unused_odt_tensors(model.network.config)) known.insert(name);
+    load_parameters(contents, file, known);
+    load_counts(contents, file);
+    const std::vector<float> log_temperature = tensor_or_text(file, "log_temperature", {});
+    if (!log_temperature.empty()) model.log_temperature.value = log_temperature;
+    const uint64_t state_dim = static_cast<uint64_t>(model.spec.state_dim);
+    model.state_mean = tensor_or_text(file, "state_mean", {state_dim});
+    model.state_std = tensor_or_text(file, "state_std", {state_dim});
+    if (model.state_mean.empty() != model.state_std.empty())
+        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
+             file.path.c_str());
+    if (model.state_mean.empty()) {
         if (settings.behaviour == "random")
             fail("import.normaliser",
                  "%s has no state_mean and state_std, and there is no data set to take them from; see --dataset",

@@ -15,17 +15,7 @@
 //   entropy_noise   step: update; index: row; site: action dimension of a ~ pi(s), plus action_dim of a' ~ pi(s')
 #pragma once
 
-#include <array>
-#include <cmath>
-#include <cstdint>
-#include <cstdio>
-#include <map>
-#include <string>
-#include <utility>
-#include <vector>
-
-#include "../memory.hpp"
-#include "../nn.hpp"
+#include "../memory.hpp"  // and with it nn.hpp and the standard headers
 #include "safetensors.hpp"
 #include "state.hpp"
 
@@ -118,7 +108,6 @@ struct Network {
         add("last_fc.bias", {out}, last_range);
     }
     int inputs() const { return static_cast<int>(parameters[0].shape[1]); }
-    int hidden() const { return static_cast<int>(parameters[0].shape[0]); }
     int outputs() const { return static_cast<int>(parameters[4].shape[0]); }
 };
 
@@ -132,14 +121,14 @@ Tensor<T> dense(Tape<T>& tape, Tensor<T> x, Parameter<T>& weight, Parameter<T>& 
     const int in = x.columns, out = weight.rows();
     const Tensor<T> y = tape.make(x.rows, out), w = weight.tensor(), b = bias.tensor();
     Compute& compute = tape.compute;
-    if (x.rows == 1)
+    const View<T> sums = {y.value, out};
+    const Epilogue<T> add_bias = {b.value, rectified};
+    if (x.rows == 1) {
         for (ptrdiff_t j = 0; j < out; ++j) y.value[j] = dot(x.value, w.value + j * in, in);
-    else
-        matmul(compute, View<T>{y.value, out}, {x.value, in}, {w.value, in, true}, x.rows, out, in, Store::overwrite);
-    for (ptrdiff_t row = 0; row < y.rows; ++row)
-        for (ptrdiff_t j = 0; j < out; ++j) y.value[row * out + j] += b.value[j];
-    if (rectified)
-        for (size_t i = 0; i < y.size(); ++i) y.value[i] = y.value[i] < 0 ? T(0) : y.value[i];  // NaN stays
+        apply_epilogue(sums, add_bias, {0, 1, 0, out});
+    } else {
+        matmul(compute, sums, {x.value, in}, {w.value, in, true}, x.rows, out, in, Store::overwrite, add_bias);
+    }
     tape.on_backward(y, [=, &compute] {
         const View<const T> dy = {y.grad(), out}, dy_transposed = {y.grad(), out, true};
         if (rectified)
@@ -168,95 +157,71 @@ Tensor<T> forward(Tape<T>& tape, Network<T>& network, Tensor<T> x, bool trained 
 // ---------------------------------------------------------------------------------------------------------------------
 // The losses.
 
+// Rows of the replay; state and action side by side are a pair.
 template <class T>
 struct Batch {
-    Tensor<T> states, pairs, next_states;  // [n, S], [n, S + A] states and actions side by side, [n, S]
-    Tensor<T> rewards, alive;              // [n, 1]; alive: 0 if the task ended there, else 1
+    Tensor<T> states, pairs, rewards, ends, next_states;  // [n, S], [n, S + A], [n, 1], [n, 1] as numbers, [n, S]
 };
-
-// A tensor without gradient, to be filled in; valid until the tape is reset.
-template <class T>
-Tensor<T> input(Tape<T>& tape, int rows, int columns) {
-    return {tape.template scratch<T>(static_cast<size_t>(rows) * columns), nullptr, rows, columns};
-}
 
 // The rows pick(0), ..., pick(n - 1) of the replay.
 template <class T, class Pick>
-Batch<T> gather(Tape<T>& tape, const Replay& replay, int n, Pick&& pick) {
-    const ptrdiff_t S = replay.state_dim, A = replay.action_dim;
-    const Batch<T> batch = {input(tape, n, replay.state_dim), input(tape, n, replay.state_dim + replay.action_dim),
-                            input(tape, n, replay.state_dim), input(tape, n, 1), input(tape, n, 1)};
-    for (ptrdiff_t i = 0; i < n; ++i) {
-        const size_t row = pick(static_cast<uint32_t>(i));
-        std::copy_n(replay.row(row), S, batch.states.value + i * S);
-        std::copy_n(replay.row(row), S + A, batch.pairs.value + i * (S + A));
-        std::copy_n(replay.next_state(row), S, batch.next_states.value + i * S);
-        batch.rewards.value[i] = static_cast<T>(replay.reward(row));
-        // A time limit is no part of the task: the target bootstraps from the state after it.
-        batch.alive.value[i] = replay.end(row) == End::terminated ? T(0) : T(1);
-    }
-    return batch;
+Batch<T> gather(Tape<T>& tape, const Replay& replay, uint32_t n, Pick&& pick) {
+    const int S = replay.state_dim, A = replay.action_dim;
+    std::vector<const float*> rows;
+    for (uint32_t i = 0; i < n; ++i) rows.push_back(replay.row(pick(i)));
+    const auto columns = [&](int first, int count) {
+        std::vector<float> x;
+        for (const float* row : rows) x.insert(x.end(), row + first, row + first + count);
+        return tape.constant(x.data(), n, count);
+    };
+    return {columns(0, S), columns(0, S + A), columns(S + A, 1), columns(S + A + 1, 1), columns(S + A + 2, S)};
 }
 
 template <class T>
 struct Sample {
-    Tensor<T> action, log_prob;  // [n, A] in [-1, 1], [n, 1]
+    Tensor<T> pairs, log_prob;  // [n, S + A] states and the actions drawn at them, in [-1, 1]; [n, 1]
 };
 
 // SAC app. C, reparametrised: a = tanh(u), u = m + exp(l) noise, and
-// log pi(a) = log N(u; m, exp(l)) - sum log(1 - tanh(u)^2). output [n, 2A]: the policy's, m, then l, which rlkit clamps
-// to [-20, 2]. noise [n, A]: standard normal.
+// log pi(a) = log N(u; m, exp(l)) - sum log(1 - tanh(u)^2). output [n, 2A]: the policy's at `states` [n, S], m, then l,
+// which rlkit clamps to [-20, 2]. noise [n, A]: standard normal. The gradient goes through the actions alone.
 template <class T>
-Sample<T> draw(Tape<T>& tape, Tensor<T> output, const float* noise) {
-    const ptrdiff_t A = output.columns / 2;
-    const Tensor<T> action = tape.make(output.rows, output.columns / 2), log_prob = tape.make(output.rows, 1);
-    const Tensor<T> normal = tape.constant(noise, action.rows, action.columns);
+Sample<T> draw(Tape<T>& tape, Tensor<T> states, Tensor<T> output, const float* noise) {
+    const ptrdiff_t S = states.columns, A = output.columns / 2, width = S + A;
+    const Tensor<T> pairs = tape.make(output.rows, states.columns + output.columns / 2);
+    const Tensor<T> log_prob = tape.make(output.rows, 1),
+                    normal = tape.constant(noise, output.rows, output.columns / 2);
     for (ptrdiff_t row = 0; row < output.rows; ++row) {
         const T *mean = output.value + row * 2 * A, *l = mean + A, *z = normal.value + row * A;
+        T* const action = std::copy_n(states.value + row * S, S, pairs.value + row * width);
         log_prob.value[row] = 0;
         for (ptrdiff_t j = 0; j < A; ++j) {
             const T log_std = std::clamp(l[j], T(-20), T(2)), u = mean[j] + std::exp(log_std) * z[j];
-            action.value[row * A + j] = std::tanh(u);
+            action[j] = std::tanh(u);
             log_prob.value[row] -= T(0.5) * z[j] * z[j] + log_std + T(half_log_2_pi) + log_tanh_slope(u);
         }
     }
     tape.on_backward({}, [=] {  // there are two results, so the step is never skipped
-        const T *d_action = gradient_of(action), *d_log_prob_of = gradient_of(log_prob);
+        const T *d_pairs = gradient_of(pairs), *d_log_prob_of = gradient_of(log_prob);
         T* const d_output = gradient_of(output);
         for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
-            const ptrdiff_t mean = i / A * 2 * A + i % A, l = mean + A;
-            const T a = action.value[i], d_log_prob = d_log_prob_of[i / A], log_std = output.value[l];
-            const T du = (T(1) - a * a) * d_action[i] + T(2) * a * d_log_prob;
+            const ptrdiff_t action = i / A * width + S + i % A, mean = i / A * 2 * A + i % A, l = mean + A;
+            const T a = pairs.value[action], d_log_prob = d_log_prob_of[i / A], log_std = output.value[l];
+            const T du = (T(1) - a * a) * d_pairs[action] + T(2) * a * d_log_prob;
             d_output[mean] += du;
             if (log_std >= T(-20) && log_std <= T(2))
                 d_output[l] += du * std::exp(log_std) * normal.value[i] - d_log_prob;
         }
     });
-    return {action, log_prob};
+    return {pairs, log_prob};
 }
 
-// States and actions side by side, [n, S + A]. The gradient goes to the actions alone.
+// min_k Q_k(s, a), [n, 1], of pairs [n, S + A]. The gradient of a row goes through the critic that gave the minimum, to
+// the pairs alone: the critics' parameters get none.
 template <class T>
-Tensor<T> pairs_of(Tape<T>& tape, Tensor<T> states, Tensor<T> actions) {
-    const ptrdiff_t S = states.columns, A = actions.columns;
-    const Tensor<T> pairs = tape.make(states.rows, states.columns + actions.columns);
-    for (ptrdiff_t i = 0; i < pairs.rows; ++i)
-        std::copy_n(actions.value + i * A, A, std::copy_n(states.value + i * S, S, pairs.value + i * (S + A)));
-    tape.on_backward(pairs, [=] {
-        T* const d_actions = gradient_of(actions);
-        for (ptrdiff_t i = 0; i < actions.rows; ++i)
-            for (ptrdiff_t j = 0; j < A; ++j) d_actions[i * A + j] += pairs.grad()[i * (S + A) + S + j];
-    });
-    return pairs;
-}
-
-// min_k Q_k(s, a), [n, 1]. The gradient of a row goes through the critic that gave the minimum, to the action alone:
-// the critics' parameters get none.
-template <class T>
-Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Tensor<T> actions) {
-    const Tensor<T> pairs = pairs_of(tape, states, actions);
+Tensor<T> least_q(Tape<T>& tape, Pair<T>& critics, Tensor<T> pairs) {
     const Tensor<T> q0 = forward(tape, critics[0], pairs, false), q1 = forward(tape, critics[1], pairs, false);
-    const Tensor<T> y = tape.make(states.rows, 1);
+    const Tensor<T> y = tape.make(pairs.rows, 1);
     for (ptrdiff_t i = 0; i < y.rows; ++i) y.value[i] = q1.value[i] < q0.value[i] ? q1.value[i] : q0.value[i];
     tape.on_backward(y, [=] {
         T *const d_q0 = gradient_of(q0), *const d_q1 = gradient_of(q1);
@@ -271,14 +236,17 @@ template <class T>
 const float* q_target(Tape<T>& tape, Network<T>& policy, Pair<T>& targets, const Batch<T>& batch, const float* noise,
                       T alpha, const Settings& settings) {
     const bool recording = std::exchange(tape.recording, false);
-    const Sample<T> sample = draw(tape, forward(tape, policy, batch.next_states), noise);
-    const Tensor<T> q = least_q(tape, targets, batch.next_states, sample.action);
+    const Sample<T> sample = draw(tape, batch.next_states, forward(tape, policy, batch.next_states), noise);
+    const Tensor<T> q = least_q(tape, targets, sample.pairs);
     tape.recording = recording;
     float* y = tape.template scratch<float>(q.size());
     const T scale = static_cast<T>(settings.reward_scale), discount = static_cast<T>(settings.discount);
-    for (size_t i = 0; i < q.size(); ++i)
-        y[i] = static_cast<float>(scale * batch.rewards.value[i] +
-                                  discount * batch.alive.value[i] * (q.value[i] - alpha * sample.log_prob.value[i]));
+    for (size_t i = 0; i < q.size(); ++i) {
+        // A time limit is no part of the task: the target bootstraps from the state after it.
+        const T rate = batch.ends.value[i] == static_cast<T>(End::terminated) ? T(0) : discount;
+        y[i] =
+            static_cast<float>(scale * batch.rewards.value[i] + rate * (q.value[i] - alpha * sample.log_prob.value[i]));
+    }
     return y;
 }
 
@@ -299,9 +267,8 @@ Tensor<T> critic_loss(Tape<T>& tape, Pair<T>& critics, const Batch<T>& batch, co
 
 // SAC eq. (9): J_pi = mean (alpha log pi(a | s) - min_k Q_k(s, a)), a = `sample` of the policy at s, [1, 1].
 template <class T>
-Tensor<T> policy_loss(Tape<T>& tape, Pair<T>& critics, Tensor<T> states, Sample<T> sample, T alpha) {
-    const Tensor<T> q = least_q(tape, critics, states, sample.action);
-    return combine(tape, alpha, mean(tape, sample.log_prob), T(-1), mean(tape, q));
+Tensor<T> policy_loss(Tape<T>& tape, Pair<T>& critics, Sample<T> sample, T alpha) {
+    return combine(tape, alpha, mean(tape, sample.log_prob), T(-1), mean(tape, least_q(tape, critics, sample.pairs)));
 }
 
 // SAC eq. (18), with log alpha for alpha, as rlkit: J(alpha) = mean (-log alpha (log pi(a | s) + target_entropy)).
@@ -315,8 +282,8 @@ T temperature_loss(Parameter<T>& log_alpha, Tensor<T> log_prob, T target_entropy
 }
 
 // SAC algorithm 1: target = (1 - rate) target + rate value.
-EACH_TARGET inline void soft_update(float* __restrict target, const float* __restrict value, size_t n, float rate) {
-    for (size_t i = 0; i < n; ++i) target[i] = (1 - rate) * target[i] + rate * value[i];
+EACH_TARGET inline void soft_update(std::vector<float>& target, const std::vector<float>& value, float rate) {
+    for (size_t i = 0; i < target.size(); ++i) target[i] = (1 - rate) * target[i] + rate * value[i];
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -327,31 +294,31 @@ EACH_TARGET inline void soft_update(float* __restrict target, const float* __res
 inline float act(Tape<float>& tape, Network<float>& policy, const float* state, const float* noise, float* action) {
     tape.reset();
     tape.recording = false;
-    const Sample<float> sample = draw(tape, forward(tape, policy, tape.constant(state, 1, policy.inputs())), noise);
-    std::copy_n(sample.action.value, sample.action.size(), action);
+    const Tensor<float> states = tape.constant(state, 1, policy.inputs());
+    const Sample<float> sample = draw(tape, states, forward(tape, policy, states), noise);
+    std::copy_n(sample.pairs.value + policy.inputs(), policy.outputs() / 2, action);
     return sample.log_prob.value[0];
 }
 
-// Plays episodes with sampled actions, or with the policy's mean action.
-struct Actor {
-    Tape<float>& tape;
-    Network<float>& policy;
-    uint32_t seed;
-    bool sampled = true;
-    std::vector<float> log_probs = {};  // [T] of the latest episode's actions
+// The same with the noise of a time-step of an episode.
+inline float act_sampled(Tape<float>& tape, Network<float>& policy, const float* state, uint32_t seed, uint64_t episode,
+                         uint32_t t, float* action) {
+    std::vector<float> noise(policy.outputs() / 2);
+    for (uint32_t i = 0; i < noise.size(); ++i) noise[i] = Random{seed, Stream::exploration}.normal(episode, t, i);
+    return act(tape, policy, state, noise.data(), action);
+}
 
-    Episode play(Environment& environment, uint64_t number) {
-        log_probs.clear();
-        return ::play(environment, {seed, Stream::environment}, number, [&](const Episode& episode) {
-            const Random random{seed, Stream::exploration};
-            std::vector<float> action(policy.outputs() / 2), noise(action.size());
-            for (uint32_t i = 0; sampled && i < noise.size(); ++i)
-                noise[i] = random.normal(number, episode.trajectory.length(), i);
-            log_probs.push_back(act(tape, policy, episode.state.data(), noise.data(), action.data()));
-            return action;
-        });
-    }
-};
+// Plays an episode with sampled actions, and appends their log-probabilities to `log_probs` if it is given.
+inline Episode play_sampled(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed,
+                            uint64_t number, std::vector<float>* log_probs = nullptr) {
+    return play(environment, {seed, Stream::environment}, number, [&](const Episode& episode) {
+        std::vector<float> action(policy.outputs() / 2);
+        const float log_prob =
+            act_sampled(tape, policy, episode.state.data(), seed, number, episode.trajectory.length(), action.data());
+        if (log_probs) log_probs->push_back(log_prob);
+        return action;
+    });
+}
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The learner.
@@ -370,34 +337,28 @@ struct Learner {
     Settings settings;
     EnvironmentSpec spec;
     Tape<float> learning, acting;
-    std::vector<float> action, noise, next_state;  // scratch
-    Losses last;                                   // of the latest update, for display and tests
+    Losses last;  // of the latest update, for tests
 
     // The state of the run, all of it saved by visit(). The environment's own state is not: resume() restores it.
     Progress progress;
-    std::vector<float> state;  // [S] of the environment
-    Network<float> policy;     // outputs: means, then log standard deviations
-    Pair<float> critics, targets;
-    std::vector<Parameter<float>> log_alpha;  // one; alpha starts at 1
+    std::vector<float> state = std::vector<float>(spec.state_dim);  // of the environment
+    Network<float> policy{spec.state_dim, settings.hidden, 2 * spec.action_dim, 1e-3, settings.seed, 0};  // m, then l
+    Pair<float> critics{critic(6), critic(12)}, targets = critics;
+    std::vector<Parameter<float>> log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}};  // one; alpha starts at 1
     Optimizer policy_optimizer, alpha_optimizer;
     std::array<Optimizer, 2> critic_optimizers;
-    Replay replay;
+    Replay replay{spec.state_dim, spec.action_dim, settings.capacity};
 
+    Network<float> critic(uint64_t first_tensor) const {
+        return {spec.state_dim + spec.action_dim, settings.hidden, 1, 3e-3, settings.seed, first_tensor};
+    }
+
+    // Errors: sac.settings.
     Learner(const Settings& s, const EnvironmentSpec& e, Compute& compute)
         : settings(s),
           spec(e),
           learning(compute),
-          acting(compute),
-          action(e.action_dim),
-          noise(2 * s.batch * action.size()),
-          next_state(e.state_dim),
-          state(next_state),
-          policy(e.state_dim, s.hidden, 2 * e.action_dim, 1e-3, s.seed, 0),
-          critics{Network<float>(e.state_dim + e.action_dim, s.hidden, 1, 3e-3, s.seed, 6),
-                  Network<float>(e.state_dim + e.action_dim, s.hidden, 1, 3e-3, s.seed, 12)},
-          targets(critics),
-          log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}},
-          replay{e.state_dim, e.action_dim, s.capacity} {
+          acting(compute) {
         if (e.discrete_actions != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1 ||
             s.steps_per_update < 1)
             fail("sac.settings",
@@ -421,67 +382,59 @@ struct Learner {
         Progress& p = progress;
         if (p.episode_steps == 0)
             environment.reset(Random{settings.seed, Stream::environment}, p.episodes, state.data());
-        choose_action();
+        const Random random{settings.seed, Stream::exploration};
+        const uint32_t t = static_cast<uint32_t>(p.episode_steps);
+        std::vector<float> action(spec.action_dim), next_state(state.size());
+        if (p.steps >= settings.random_steps)
+            act_sampled(acting, policy, state.data(), settings.seed, p.episodes, t, action.data());
+        else
+            for (uint32_t i = 0; i < action.size(); ++i)
+                action[i] = static_cast<float>(2 * random.uniform(p.episodes, t, i) - 1);
         ++p.steps;
-        bool over = false;
+        End end = End::cut;
         try {
             const Step result = environment.step(action.data(), next_state.data());
             ++p.episode_steps;
-            over = result.terminated || p.episode_steps >= static_cast<uint64_t>(spec.max_episode_steps);
-            const End end = result.terminated ? End::terminated : over ? End::cut : End::none;
+            const bool at_limit = p.episode_steps >= static_cast<uint64_t>(spec.max_episode_steps);
+            end = result.terminated ? End::terminated : at_limit ? End::cut : End::none;
             replay.add(state.data(), action.data(), result.reward, end, next_state.data(), p.episodes);
             state = next_state;
         } catch (const Error& error) {
             if (error.id != "environment.unstable") throw;
             if (p.episode_steps > 0) replay.cut_last();
-            over = true;
         }
-        if (over) {
-            p.episode_steps = 0;
-            ++p.episodes;
-        }
-    }
-
-    void choose_action() {
-        const Random random{settings.seed, Stream::exploration};
-        const uint32_t t = static_cast<uint32_t>(progress.episode_steps);
-        if (progress.steps < settings.random_steps) {
-            for (uint32_t i = 0; i < action.size(); ++i)
-                action[i] = static_cast<float>(2 * random.uniform(progress.episodes, t, i) - 1);
-            return;
-        }
-        for (uint32_t i = 0; i < action.size(); ++i) noise[i] = random.normal(progress.episodes, t, i);
-        act(acting, policy, state.data(), noise.data(), action.data());
+        if (end == End::none) return;
+        p.episode_steps = 0;
+        ++p.episodes;
     }
 
     // SAC algorithm 1, in rlkit's order: first the temperature, then all networks, each with gradients at the old ones.
     void update() {
         const Random rows{settings.seed, Stream::batch}, normals{settings.seed, Stream::entropy_noise};
         const uint64_t number = progress.updates++;
-        const size_t A = action.size(), n = static_cast<size_t>(settings.batch);
-        for (size_t i = 0; i < 2 * n * A; ++i)
+        const size_t A = spec.action_dim, n = settings.batch;
+        std::vector<float> noise(2 * n * A);
+        for (size_t i = 0; i < noise.size(); ++i)
             noise[i] = normals.normal(number, static_cast<uint32_t>(i / A % n),
                                       static_cast<uint32_t>(i % A + (i < n * A ? 0 : A)));
         learning.reset();
         Tape<float>& tape = learning;
         const Batch<float> batch =
             gather(tape, replay, settings.batch, [&](uint32_t i) { return rows.below(replay.size(), number, i); });
-        const Sample<float> sample = draw(tape, forward(tape, policy, batch.states), noise.data());
+        const Sample<float> sample = draw(tape, batch.states, forward(tape, policy, batch.states), noise.data());
         temperature_loss(log_alpha[0], sample.log_prob, -static_cast<float>(spec.action_dim));
         adam(log_alpha, alpha_optimizer);
         const float alpha = std::exp(log_alpha[0].value[0]);
         const float* target = q_target(tape, policy, targets, batch, noise.data() + n * A, alpha, settings);
         const Tensor<float> critic = critic_loss(tape, critics, batch, target),
-                            actor = policy_loss(tape, critics, batch.states, sample, alpha);
+                            actor = policy_loss(tape, critics, sample, alpha);
         tape.backward(combine(tape, 1.0f, critic, 1.0f, actor));  // the two losses share no parameter
         adam(policy.parameters, policy_optimizer);
         for (size_t k = 0; k < 2; ++k) {
             adam(critics[k].parameters, critic_optimizers[k]);
-            for (size_t i = 0; i < critics[k].parameters.size(); ++i) {
-                const std::vector<float>& value = critics[k].parameters[i].value;
-                soft_update(targets[k].parameters[i].value.data(), value.data(), value.size(),
+            for (size_t i = 0; i < critics[k].parameters.size(); ++i)
+                soft_update(targets[k].parameters[i].value, critics[k].parameters[i].value,
                             static_cast<float>(settings.target_rate));
-            }
         }
         double log_prob = 0;
         for (size_t i = 0; i < n; ++i) log_prob += static_cast<double>(sample.log_prob.value[i]);
@@ -490,12 +443,11 @@ struct Learner {
     }
 
     void adam(std::vector<Parameter<float>>& parameters, Optimizer& optimizer) {
-        OptimizerConfig config;
-        config.rule = OptimizerConfig::Rule::adamw;  // without decay: Adam
-        config.learning_rate = settings.learning_rate;
-        config.clip_norm = 0;
-        config.warmup_updates = 0;
-        update_parameters(learning.compute, parameters, optimizer, config);
+        update_parameters(learning.compute, parameters, optimizer,
+                          {.rule = OptimizerConfig::Rule::adamw,  // without decay: Adam
+                           .learning_rate = settings.learning_rate,
+                           .clip_norm = 0,
+                           .warmup_updates = 0});
     }
 
     // Brings an environment to the state of a loaded run, by repeating the present episode's actions, which the replay
@@ -542,8 +494,8 @@ inline std::string settings_text(const Learner& learner) {
     char text[400];
     std::snprintf(text, sizeof text,
                   "seed=%u hidden=%d batch=%d capacity=%llu random_steps=%llu steps_per_update=%llu "
-                  "learning_rate=%.17g discount=%.17g "
-                  "target_rate=%.17g reward_scale=%.17g state_dim=%d action_dim=%d max_episode_steps=%d kernel=%s",
+                  "learning_rate=%.17g discount=%.17g target_rate=%.17g reward_scale=%.17g state_dim=%d "
+                  "action_dim=%d max_episode_steps=%d kernel=%s",
                   s.seed, s.hidden, s.batch, static_cast<unsigned long long>(s.capacity),
                   static_cast<unsigned long long>(s.random_steps), static_cast<unsigned long long>(s.steps_per_update),
                   s.learning_rate, s.discount, s.target_rate, s.reward_scale, learner.spec.state_dim,
@@ -576,11 +528,6 @@ inline void load_checkpoint(const std::string& path, Learner& learner, const std
     learner.visit(loader);
 }
 
-struct SavedPolicy {
-    Network<float> network;
-    std::map<std::string, std::string> metadata;  // task, physics, return, steps, ...
-};
-
 // Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256] (the means) and
 // last_fc_log_std.*: D4RL's names and PyTorch's layout. `parameters` may be const.
 template <class Parameters, class F>
@@ -596,32 +543,32 @@ void each_policy_tensor(Parameters& parameters, F&& f) {
         }
 }
 
-inline void save_policy(const std::string& path, const SavedPolicy& policy) {
+// metadata: the name, the return and so on.
+inline void save_policy(const std::string& path, const Network<float>& policy,
+                        const std::map<std::string, std::string>& metadata = {}) {
     TensorFile file;
-    file.metadata = policy.metadata;
+    file.metadata = metadata;
     file.metadata["nonlinearity"] = "relu";
     file.metadata["output_distribution"] = "tanh_gaussian";
-    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+    each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.add(name, shape, values);
     });
     write_safetensors(path, file);
 }
 
 // The policy that save_policy() wrote. Errors: sac.policy, safetensors.*
-inline SavedPolicy policy_of(const TensorFile& file) {
+inline Network<float> policy_of(const TensorFile& file) {
     const Shape first = file.find("fc0.weight").shape, last = file.find("last_fc.weight").shape;
     const auto too_large = [](uint64_t extent) { return extent < 1 || extent > 1 << 14; };
     if (first.size() != 2 || last.size() != 2 || too_large(first[0]) || too_large(first[1]) || too_large(last[0]))
         fail("sac.policy", "%s: fc0.weight %s and last_fc.weight %s are not those of a policy", file.path.c_str(),
              shape_text(first).c_str(), shape_text(last).c_str());
-    const int hidden = static_cast<int>(first[0]);
-    SavedPolicy policy = {{static_cast<int>(first[1]), hidden, static_cast<int>(2 * last[0]), 1, 0, 0}, file.metadata};
-    each_policy_tensor(policy.network.parameters, [&](const std::string& name, const Shape& shape, auto values) {
+    Network<float> policy(static_cast<int>(first[1]), static_cast<int>(first[0]), static_cast<int>(2 * last[0]), 1, 0,
+                          0);
+    each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.read_into(values, name, shape);
     });
     return policy;
 }
-
-inline SavedPolicy load_policy(const std::string& path) { return policy_of(read_safetensors(path)); }
 
 }  // namespace sac

@@ -9,25 +9,15 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include <algorithm>
-#include <array>
 #include <bit>
 #include <cerrno>
 #include <charconv>
-#include <cstdint>
-#include <cstdio>
-#include <cstring>
-#include <map>
 #include <optional>
 #include <ranges>
 #include <span>
-#include <string>
 #include <string_view>
-#include <type_traits>
-#include <utility>
-#include <vector>
 
-#include "../nn.hpp"
+#include "../nn.hpp"  // and with it the other standard headers
 
 static_assert(std::endian::native == std::endian::little, "tensors are copied as they lie in memory");
 static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
@@ -38,8 +28,7 @@ static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
 struct FileDescriptor {
     int fd;
     explicit FileDescriptor(int opened) : fd(opened) {}
-    FileDescriptor(const FileDescriptor&) = delete;
-    FileDescriptor& operator=(const FileDescriptor&) = delete;
+    FileDescriptor(FileDescriptor&&) = delete;  // nor are there copies
     ~FileDescriptor() {
         if (fd >= 0) ::close(fd);
     }
@@ -50,27 +39,43 @@ struct FileDescriptor {
     fail(id, "%s: cannot %s: %s", path.c_str(), action, std::strerror(errno));
 }
 
-// Opens a file or fails with `id`. O_NONBLOCK: opening a named pipe must not wait for its other end.
-inline FileDescriptor open_file(const std::string& path, int flags, const char* id, const char* action) {
-    const int fd = ::open(path.c_str(), flags | O_CLOEXEC | O_NONBLOCK, 0666);
-    if (fd < 0) fail_file(id, action, path);
-    return FileDescriptor(fd);
-}
+// An open file. Its functions fail with file.read and file.write.
+struct File : FileDescriptor {
+    std::string path;
 
-// Returns the size in bytes of an open regular file. Errors: file.not_regular for a folder, pipe or device; file.read.
-inline size_t regular_file_size(const FileDescriptor& file, const std::string& path) {
-    struct stat status {};
-    if (::fstat(file.fd, &status) != 0) fail_file("file.read", "ask for its size", path);
-    if (!S_ISREG(status.st_mode))
-        fail("file.not_regular", "%s: is not a regular file; give a file's path", path.c_str());
-    return static_cast<size_t>(status.st_size);
-}
+    // Errors: `id`. O_NONBLOCK: opening a named pipe must not wait for its other end.
+    File(const std::string& name, int flags, const char* id, const char* action)
+        : FileDescriptor(::open(name.c_str(), flags | O_CLOEXEC | O_NONBLOCK, 0666)),
+          path(name) {
+        if (fd < 0) fail_file(id, action, path);
+    }
+    // Returns the size in bytes of a regular file. Errors: file.not_regular for a folder, pipe or device.
+    size_t size() const {
+        struct stat status {};
+        if (::fstat(fd, &status) != 0) fail_file("file.read", "ask for its size", path);
+        if (!S_ISREG(status.st_mode))
+            fail("file.not_regular", "%s: is not a regular file; give a file's path", path.c_str());
+        return static_cast<size_t>(status.st_size);
+    }
+    // This is the only call of write(), which may be interrupted and may take fewer bytes than it was given (POSIX).
+    void write(std::string_view bytes) const {
+        while (!bytes.empty()) {
+            const ssize_t count = ::write(fd, bytes.data(), bytes.size());
+            if (count < 0 && errno == EINTR) continue;
+            if (count < 0) fail_file("file.write", "write it", path);
+            bytes.remove_prefix(static_cast<size_t>(count));
+        }
+    }
+    void sync() const {
+        if (::fsync(fd) != 0) fail_file("file.write", "flush it to the disk", path);
+    }
+};
 
 // Returns the whole file. `limit` (bytes) is checked before anything is allocated. Errors: file.open, file.not_regular,
 // file.too_large, file.read.
 inline std::string read_file(const std::string& path, size_t limit = size_t{1} << 36) {
-    const FileDescriptor file = open_file(path, O_RDONLY, "file.open", "open it");
-    const size_t size = regular_file_size(file, path);
+    const File file(path, O_RDONLY, "file.open", "open it");
+    const size_t size = file.size();
     if (size > limit) fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), size, limit);
     std::string bytes(size, '\0');
     for (size_t done = 0; done < size;) {
@@ -83,89 +88,58 @@ inline std::string read_file(const std::string& path, size_t limit = size_t{1} <
     return bytes;
 }
 
-// This is the only call of write(), which may be interrupted and may take fewer bytes than it was given (POSIX).
-inline void write_all(const FileDescriptor& file, std::string_view bytes, const std::string& path) {
-    while (!bytes.empty()) {
-        const ssize_t count = ::write(file.fd, bytes.data(), bytes.size());
-        if (count < 0 && errno == EINTR) continue;
-        if (count < 0) fail_file("file.write", "write it", path);
-        bytes.remove_prefix(static_cast<size_t>(count));
-    }
-}
-
-inline void sync_to_disk(const FileDescriptor& file, const std::string& path) {
-    if (::fsync(file.fd) != 0) fail_file("file.write", "flush it to the disk", path);
-}
-
-// Makes a rename last: without this call a power cut may bring the old name back.
-inline void sync_folder_of(const std::string& path) {
-    const size_t slash = path.find_last_of('/');
-    const std::string folder = slash == std::string::npos ? "." : path.substr(0, slash + 1);
-    const FileDescriptor file = open_file(folder, O_RDONLY | O_DIRECTORY, "file.write", "open the folder to flush it");
-    // EINVAL: this file system has no such operation.
-    if (::fsync(file.fd) != 0 && errno != EINVAL) fail_file("file.write", "flush the folder to the disk", folder);
-}
-
 // A file that appears as a whole: other programs see the old file or the complete new one. Bytes go to PATH.tmp until
 // commit() renames it; without commit() the temporary is removed. One left by a killed process is overwritten.
 struct AtomicFile {
-    std::string path, temporary;
-    FileDescriptor file;
+    std::string path, temporary = path + ".tmp";
+    File file{temporary, O_WRONLY | O_CREAT | O_TRUNC, "file.write", "create it"};
     bool renamed = false;
 
-    explicit AtomicFile(const std::string& path_)
-        : path(path_),
-          temporary(path + ".tmp"),
-          file(open_file(temporary, O_WRONLY | O_CREAT | O_TRUNC, "file.write", "create it")) {}
+    explicit AtomicFile(const std::string& path_) : path(path_) {}
     ~AtomicFile() {
         if (!renamed) ::unlink(temporary.c_str());
     }
-    void write(std::string_view bytes) const { write_all(file, bytes, temporary); }
+    void write(std::string_view bytes) const { file.write(bytes); }
     void commit() {
-        sync_to_disk(file, temporary);
+        file.sync();
         if (::rename(temporary.c_str(), path.c_str()) != 0)
             fail_file("file.write", "rename its temporary file to it", path);
         renamed = true;
-        sync_folder_of(path);  // if only this fails, the new file is already in place
+        // Until the folder is flushed, a power cut may bring the old name back.
+        const std::string parent = path.substr(0, path.find_last_of('/') + 1);
+        const File folder(parent.empty() ? "." : parent, O_RDONLY | O_DIRECTORY, "file.write",
+                          "open the folder to flush it");
+        // EINVAL: this file system has no such operation.
+        if (::fsync(folder.fd) != 0 && errno != EINVAL)
+            fail_file("file.write", "flush the folder to the disk", folder.path);
     }
 };
 
-// Makes the pieces, one after the other, the file `path`, or leaves the old one. Errors: file.write.
-inline void write_file_atomic(const std::string& path, std::span<const std::string_view> pieces) {
+inline void write_file_atomic(const std::string& path, std::string_view bytes) {
     AtomicFile file(path);
-    for (const std::string_view piece : pieces) file.write(piece);
+    file.write(bytes);
     file.commit();
 }
 
-inline void write_file_atomic(const std::string& path, std::string_view bytes) {
-    write_file_atomic(path, std::span<const std::string_view>(&bytes, 1));
-}
-
 // A log that grows. append() gives text to the system at once (no buffer), sync() brings it to the disk. A checkpoint
-// notes size() after sync(); a run that continues from the checkpoint gives that size to truncate_file first.
-struct AppendFile {
-    std::string path;
-    FileDescriptor file;
-
-    explicit AppendFile(const std::string& path_)
-        : path(path_),
-          file(open_file(path, O_WRONLY | O_CREAT | O_APPEND, "file.open", "open it for writing")) {
-        regular_file_size(file, path);
+// notes the size after sync(); a run that continues from the checkpoint gives that size to truncate_file first.
+struct AppendFile : File {
+    explicit AppendFile(const std::string& name)
+        : File(name, O_WRONLY | O_CREAT | O_APPEND, "file.open", "open it for writing") {
+        size();
     }
-    void append(std::string_view text) const { write_all(file, text, path); }
-    void sync() const { sync_to_disk(file, path); }
-    size_t size() const { return regular_file_size(file, path); }
+    void append(std::string_view text) const { write(text); }
 };
 
 // Drops what a log gained after the checkpoint that noted `size` bytes. Errors: file.open, file.shorter, file.write.
 inline void truncate_file(const std::string& path, size_t size) {
-    const FileDescriptor file = open_file(path, O_WRONLY, "file.open", "open it for writing");
-    const size_t found = regular_file_size(file, path);
+    const File file(path, O_WRONLY, "file.open", "open it for writing");
+    const size_t found = file.size();
     if (found < size)
         fail("file.shorter", "%s: has %zu bytes, the checkpoint was saved when it had %zu; restore it or start anew",
              path.c_str(), found, size);
     if (::ftruncate(file.fd, static_cast<off_t>(size)) != 0) fail_file("file.write", "shorten it", path);
-    sync_to_disk(file, path);
+    file.sync();
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -176,9 +150,8 @@ inline void truncate_file(const std::string& path, size_t size) {
 inline constexpr auto crc_tables = [] {
     std::array<std::array<uint32_t, 256>, 8> tables{};
     for (uint32_t byte = 0; byte < 256; ++byte) {
-        uint32_t crc = byte;
+        uint32_t& crc = tables[0][byte] = byte;
         for (int bit = 0; bit < 8; ++bit) crc = (crc >> 1) ^ ((crc & 1) != 0 ? 0xEDB88320u : 0u);
-        tables[0][byte] = crc;
     }
     for (size_t k = 1; k < 8; ++k)
         for (size_t byte = 0; byte < 256; ++byte)
@@ -254,16 +227,14 @@ inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"U8", 1},  {"U32
                                        {"U64", 8}, {"I32", 4}, {"I64", 8}, {"BOOL", 1}};
 inline const DTypeInfo& about(DType dtype) { return dtypes[static_cast<size_t>(dtype)]; }
 
+// A DType's name is a letter for the kind and the number of bits. For a type that has none this does not compile.
 template <class T>
 consteval DType dtype_of() {
-    if constexpr (std::is_same_v<T, float>) return DType::F32;
-    if constexpr (std::is_same_v<T, double>) return DType::F64;
-    if constexpr (std::is_same_v<T, uint8_t>) return DType::U8;
-    if constexpr (std::is_same_v<T, uint32_t>) return DType::U32;
-    if constexpr (std::is_same_v<T, uint64_t>) return DType::U64;
-    if constexpr (std::is_same_v<T, int32_t>) return DType::I32;
-    if constexpr (std::is_same_v<T, int64_t>) return DType::I64;
-}  // any other type does not compile: no return
+    constexpr char kind = std::is_floating_point_v<T> ? 'F' : std::is_signed_v<T> ? 'I' : 'U';
+    size_t i = 0;
+    while (dtypes[i].name[0] != kind || dtypes[i].size != sizeof(T)) ++i;
+    return static_cast<DType>(i);
+}
 
 using Shape = std::vector<uint64_t>;  // {} is a scalar: one element
 
@@ -275,12 +246,12 @@ inline std::string shape_text(const Shape& shape) {
     return text + (shape.size() > 16 ? ", ... of " + std::to_string(shape.size()) : "") + "]";
 }
 
-// Sets `size` to the bytes of a tensor. Returns false if they do not fit 64 bits.
-inline bool byte_size(size_t& size, const Shape& shape, DType dtype) {
-    size = about(dtype).size;
+// Returns the bytes of a tensor, or nothing if they do not fit 64 bits.
+inline std::optional<size_t> byte_size(const Shape& shape, DType dtype) {
+    size_t size = about(dtype).size;
     for (const uint64_t extent : shape)
-        if (__builtin_mul_overflow(size, extent, &size)) return false;
-    return true;
+        if (__builtin_mul_overflow(size, extent, &size)) return {};
+    return size;
 }
 
 // Returns the place that a message begins with. A damaged file's name may be of any length.
@@ -341,14 +312,13 @@ struct TensorFile {
         const std::span given(std::ranges::data(values), std::ranges::size(values));
         constexpr DType dtype = dtype_of<std::ranges::range_value_t<Values>>();
         check_name(name, path);
-        size_t size = 0;
-        if (!byte_size(size, shape, dtype) || size != given.size_bytes())
+        if (byte_size(shape, dtype) != given.size_bytes())
             fail("safetensors.shape", "%s: has shape %s and was given %zu elements", tensor_place(path, name).c_str(),
                  shape_text(shape).c_str(), given.size());
         if (!index.emplace(name, tensors.size()).second)
             fail("safetensors.duplicate_name", "%s: was added twice", tensor_place(path, name).c_str());
-        tensors.push_back({name, dtype, shape, data().size(), size});
-        if (size > 0) buffer.append(reinterpret_cast<const char*>(given.data()), size);
+        tensors.push_back({name, dtype, shape, data().size(), given.size_bytes()});
+        if (!given.empty()) buffer.append(reinterpret_cast<const char*>(given.data()), given.size_bytes());
     }
 
     // Copies tensor `name` to `out`. Errors: safetensors.missing; safetensors.dtype and safetensors.shape if the type,
@@ -427,8 +397,10 @@ inline std::string file_start(const TensorFile& file) {
 
 // Writes the file in two pieces: several hundred megabytes of data are not copied once more.
 inline void write_safetensors(const std::string& path, const TensorFile& file) {
-    const std::string start = file_start(file);
-    write_file_atomic(path, std::array{std::string_view(start), file.data()});
+    AtomicFile out(path);
+    out.write(file_start(file));
+    out.write(file.data());
+    out.commit();
 }
 
 // Reads the JSON. Nothing here recurses: a header is objects two deep, read by nested calls, and anything else is
@@ -453,8 +425,12 @@ struct HeaderReader {
         if (!take(c)) expected(std::string(1, c).c_str());
     }
 
-    // Returns \uXXXX as UTF-8. Surrogate pairs are refused: other programs write characters above U+FFFF as UTF-8.
-    std::string unicode_escape() {
+    // Returns what an escape stands for, as UTF-8. Surrogate pairs are refused: other programs write characters above
+    // U+FFFF as UTF-8.
+    std::string escape() {
+        const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
+        if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
+        if (which < 8) return {"\"\\/\b\f\n\r\t"[which]};
         uint32_t code = 0;
         const std::string_view digits = file.substr(at, 4);
         const char* end = digits.data() + digits.size();
@@ -473,13 +449,7 @@ struct HeaderReader {
             if (at >= file.size() || static_cast<uint8_t>(file[at]) < 0x20) expected("the end of a string");
             const char c = file[at++];
             if (c == '"') return out;
-            if (c != '\\') {
-                out += c;
-                continue;
-            }
-            const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
-            if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
-            out += which == 8 ? unicode_escape() : std::string(1, "\"\\/\b\f\n\r\t"[which]);
+            out += c == '\\' ? escape() : std::string(1, c);
         }
     }
     uint64_t integer() {
@@ -492,28 +462,30 @@ struct HeaderReader {
         at += static_cast<size_t>(end - begin);
         return value;
     }
+    // Reads items separated by commas between two brackets.
+    template <class Item>
+    void list(char open, char close, const Item& item) {
+        need(open);
+        if (take(close)) return;
+        do item();
+        while (take(','));
+        need(close);
+    }
     Shape integers() {
         Shape out;
-        need('[');
-        if (take(']')) return out;
-        do out.push_back(integer());
-        while (take(','));
-        need(']');
+        list('[', ']', [&] { out.push_back(integer()); });
         return out;
     }
     // Calls member(key) with the reader at each value; member returns false if the key came before.
     template <class Member>
     void object(const Member& member) {
-        need('{');
-        if (take('}')) return;
-        do {
+        list('{', '}', [&] {
             const std::string key = string();
             need(':');
             if (!member(key))
                 fail("safetensors.duplicate_name", "%s: offset %zu: the name %s came before", path.c_str(), at,
                      json_string(key.substr(0, 80)).c_str());
-        } while (take(','));
-        need('}');
+        });
     }
 };
 
@@ -542,18 +514,16 @@ inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
     const size_t begin = offsets->front(), end = offsets->back();
     if (begin > end)
         fail("safetensors.offsets", "%s: data_offsets %zu, %zu end before they begin", place.c_str(), begin, end);
-    size_t size = 0;
-    if (!byte_size(size, *shape, *dtype) || size != end - begin)
+    if (byte_size(*shape, *dtype) != end - begin)
         fail("safetensors.shape", "%s: shape %s of %s does not fill data_offsets %zu, %zu", place.c_str(),
              shape_text(*shape).c_str(), about(*dtype).name, begin, end);
-    return {name, *dtype, *shape, begin, size};
+    return {name, *dtype, *shape, begin, end - begin};
 }
 
 // Refuses holes, overlaps and a rest. Sorts the tensors by place: a header of another program may have any order.
 inline void check_layout(TensorFile& file) {
-    std::stable_sort(file.tensors.begin(), file.tensors.end(), [](const StoredTensor& a, const StoredTensor& b) {
-        return std::pair(a.begin, a.size) < std::pair(b.begin, b.size);  // an empty tensor before the one that follows
-    });
+    // By size too: an empty tensor comes before the one that follows it.
+    std::ranges::stable_sort(file.tensors, {}, [](const StoredTensor& t) { return std::pair(t.begin, t.size); });
     const size_t available = file.data().size();
     size_t next = 0;
     for (const StoredTensor& tensor : file.tensors) {
@@ -626,8 +596,8 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
 
     check_layout(file);
     check_checksums(file);
-    file.index.clear();  // the places are known only after the sort
-    for (size_t i = 0; i < file.tensors.size(); ++i) file.index.emplace(file.tensors[i].name, i);
+    file.index.erase("__metadata__");
+    for (size_t i = 0; i < file.tensors.size(); ++i) file.index[file.tensors[i].name] = i;  // known after the sort
     return file;
 }
 
@@ -645,8 +615,9 @@ struct Saver {
         file.add(name, {size.value_or(values.size())}, values);
     }
     template <class T>
-    requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T value) { file.add(name, {}, std::array{value}); }
+    void operator()(const std::string& name, const T& value) {
+        file.add(name, {}, std::array{value});
+    }
 };
 
 // Errors: those of TensorFile::read_into.
@@ -661,6 +632,7 @@ struct Loader {
         file.read_into(std::span<T>(values), name, {values.size()});
     }
     template <class T>
-    requires std::is_arithmetic_v<T>
-    void operator()(const std::string& name, T& value) { value = file.get<T>(name, {})[0]; }
+    void operator()(const std::string& name, T& value) {
+        value = file.get<T>(name, {})[0];
+    }
 };

@@ -5,14 +5,7 @@
 // Leaves out: files; what a run consists of (wodtem.cpp).
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <string>
-#include <vector>
-
-#include "../memory.hpp"
-#include "../nn.hpp"
+#include "../memory.hpp"  // and with it nn.hpp and the standard headers
 
 // Visits trained parameters and the state of their optimiser: "NAME.updates", then for each parameter "NAME.value.P",
 // "NAME.first_moment.P" and "NAME.second_moment.P". Values are loaded in place, because tensors point at them; moments
@@ -36,73 +29,66 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
 // ---------------------------------------------------------------------------------------------------------------------
 // The replay buffer: trajectories laid end to end; returns are computed again.
 
-// What visit_replay() reads. states [steps, state_dim], actions [steps, action_dim], rewards [steps].
-struct PackedReplay {
+// Visits states [steps, state_dim], actions [steps, action_dim] and rewards [steps] of all trajectories, and each one's
+// length and end. Errors: checkpoint.replay if the sizes do not fit together; those of relabel().
+template <class Archive>
+void visit_replay(Archive& archive, ReplayBuffer& replay) {
     std::vector<float> states, actions, rewards;
-    std::vector<uint32_t> lengths, terminated;  // [trajectories]
-};
-
-inline PackedReplay pack(const ReplayBuffer& replay) {
-    PackedReplay packed;
+    std::vector<uint32_t> lengths, terminated;
     const auto append = [](auto& all, const auto& part) { all.insert(all.end(), part.begin(), part.end()); };
-    for (const Trajectory& trajectory : replay.trajectories) {
-        append(packed.states, trajectory.states);
-        append(packed.actions, trajectory.actions);
-        append(packed.rewards, trajectory.rewards);
-        packed.lengths.push_back(static_cast<uint32_t>(trajectory.length()));
-        packed.terminated.push_back(trajectory.terminated);
-    }
-    return packed;
-}
+    if (!archive.loading)
+        for (const Trajectory& trajectory : replay.trajectories) {
+            append(states, trajectory.states);
+            append(actions, trajectory.actions);
+            append(rewards, trajectory.rewards);
+            lengths.push_back(static_cast<uint32_t>(trajectory.length()));
+            terminated.push_back(trajectory.terminated);
+        }
+    archive("replay.states", states);
+    archive("replay.actions", actions);
+    archive("replay.rewards", rewards);
+    archive("replay.lengths", lengths);
+    archive("replay.terminated", terminated);
+    archive("replay.next", replay.next);
+    if (!archive.loading) return;
 
-// Errors: checkpoint.replay if the sizes do not fit together, and those of relabel().
-inline void unpack(const PackedReplay& packed, ReplayBuffer& replay) {
-    const size_t S = replay.state_dim, A = replay.action_dim, count = packed.lengths.size();
-    size_t steps = 0;
-    for (const uint32_t length : packed.lengths) steps += length;
-    if (count != packed.terminated.size() || count > replay.capacity || steps != packed.rewards.size() ||
-        packed.states.size() != steps * S || packed.actions.size() != steps * A ||
+    const size_t S = replay.state_dim, A = replay.action_dim, count = lengths.size();
+    const size_t steps = std::accumulate(lengths.begin(), lengths.end(), size_t{0});
+    if (count != terminated.size() || count > replay.capacity || steps != rewards.size() ||
+        states.size() != steps * S || actions.size() != steps * A ||
         replay.next >= std::max<size_t>(replay.capacity, 1) || (count < replay.capacity && replay.next != 0))
         fail("checkpoint.replay",
              "the replay buffer does not fit together: %zu trajectories of %zu steps in all (at most %zu "
              "trajectories), %zu flags, %zu states of %zu, %zu actions of %zu, %zu rewards, next %zu",
-             count, steps, replay.capacity, packed.terminated.size(), packed.states.size(), S, packed.actions.size(), A,
-             packed.rewards.size(), static_cast<size_t>(replay.next));
-    replay.trajectories.clear();
-    const auto slice = [](const std::vector<float>& all, size_t first, size_t size) {
-        return std::vector<float>(all.data() + first, all.data() + first + size);
-    };
-    for (size_t i = 0, t = 0; i < count; t += packed.lengths[i], ++i) {
-        const size_t T = packed.lengths[i];
-        Trajectory trajectory;
-        trajectory.states = slice(packed.states, t * S, T * S);
-        trajectory.actions = slice(packed.actions, t * A, T * A);
-        trajectory.rewards = slice(packed.rewards, t, T);
-        trajectory.terminated = packed.terminated[i] != 0;
+             count, steps, replay.capacity, terminated.size(), states.size(), S, actions.size(), A, rewards.size(),
+             static_cast<size_t>(replay.next));
+    replay.trajectories.assign(count, {});
+    for (size_t i = 0, t = 0; i < count; t += lengths[i], ++i) {
+        Trajectory& trajectory = replay.trajectories[i];
+        const auto take = [&](std::vector<float>& part, const std::vector<float>& all, size_t width) {
+            part.assign(all.data() + t * width, all.data() + (t + lengths[i]) * width);
+        };
+        take(trajectory.states, states, S);
+        take(trajectory.actions, actions, A);
+        take(trajectory.rewards, rewards, 1);
+        trajectory.terminated = terminated[i] != 0;
         relabel(trajectory, replay.state_dim, replay.action_dim, replay.gamma);
-        replay.trajectories.push_back(std::move(trajectory));
     }
     replay.count_steps();
-}
-
-template <class Archive>
-void visit_replay(Archive& archive, ReplayBuffer& replay) {
-    PackedReplay packed;
-    if (!archive.loading) packed = pack(replay);
-    archive("replay.states", packed.states);
-    archive("replay.actions", packed.actions);
-    archive("replay.rewards", packed.rewards);
-    archive("replay.lengths", packed.lengths);
-    archive("replay.terminated", packed.terminated);
-    archive("replay.next", replay.next);
-    if (archive.loading) unpack(packed, replay);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The episodic memory: its columns; everything else is derived from them.
 
 // Errors: checkpoint.memory names the column and the condition that no run can have broken.
-inline void check_memory(const EpisodicMemory& memory) {
+template <class Archive>
+void visit_memory(Archive& archive, EpisodicMemory& memory) {
+    EpisodicMemory::for_each_column(memory, [&](const char* name, auto& column, size_t) { archive(name, column); });
+    archive("memory.projection", memory.projection);
+    archive("memory.accesses", memory.accesses);
+    archive("memory.insertions", memory.insertions);
+    if (!archive.loading) return;
+
     const auto require = [](bool holds, const char* name, const char* condition) {
         if (!holds) fail("checkpoint.memory", "the episodic memory does not fit together: %s %s", name, condition);
     };
@@ -127,15 +113,5 @@ inline void check_memory(const EpisodicMemory& memory) {
     std::vector<Words4> keys;
     for (size_t i = 0; i < n; ++i) keys.push_back(memory.key_of(i));
     require(!has_repetition(keys), "memory.keys", "holds a key twice");
-}
-
-template <class Archive>
-void visit_memory(Archive& archive, EpisodicMemory& memory) {
-    EpisodicMemory::for_each_column(memory, [&](const char* name, auto& column, size_t) { archive(name, column); });
-    archive("memory.projection", memory.projection);
-    archive("memory.accesses", memory.accesses);
-    archive("memory.insertions", memory.insertions);
-    if (!archive.loading) return;
-    check_memory(memory);
     memory.rebuild_derived();
 }

@@ -277,10 +277,9 @@ TEST(ant_maze_actions_are_the_walkers_plus_noise) {
 
 TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
     const Scratch scratch("antmaze");
-    const MujocoTask& task = task_of("antmaze-umaze");
     const std::string path = scratch / "set.hdf5";
     constexpr size_t steps = 4 * 701;
-    collect_antmaze(path, task, steps, {"test", test_seed()}, embedded_policy(walker_name), [](size_t) {});
+    collect_data_set_file("antmaze-umaze-v2", path, steps, test_seed(), "", 1, {});
     const Hdf5File file = open_hdf5(path);
     const std::pair<const char*, const char*> types[] = {
         {"observations", "float32"}, {"actions", "float32"},    {"rewards", "float32"},    {"terminals", "float32"},
@@ -291,8 +290,9 @@ TEST(an_ant_maze_set_has_d4rls_layout_and_its_walker_arrives) {
     CHECK(rows.count == steps && rows.state_dim == 29 && rows.action_dim == 8);
     // Nine in ten episodes arrive, so of four hardly ever none does.
     CHECK(std::count(rows.rewards.begin(), rows.rewards.end(), 1.0f) > 0);
-    CHECK_FAILS("collect.policy",
-                collect_antmaze(path, task, 10, {"", 0}, embedded_policy("hopper-medium"), [](size_t) {}));
+    const std::string other = scratch / "hopper.safetensors";
+    sac::save_policy(other, embedded_policy("hopper-medium"));
+    CHECK_FAILS("collect.policy", collect_data_set_file("antmaze-umaze-v2", path, 10, 0, other, 1, {}));
     CHECK_FAILS("collect.policy", embedded_policy("hopper-expert"));
 }
 
@@ -325,7 +325,9 @@ std::string replay_bytes(const MujocoTask& task, const Training& training, size_
         int asked = 0;
         Watch watch;
         watch.stop = [&] { return ++asked > stop; };
-        const auto make = [&] { collect_medium_replay(path, task, steps, origin, training, checkpoint, watch); };
+        const auto make = [&] {
+            collect_medium_replay(path, task, steps, origin, training, one_thread(), checkpoint, watch);
+        };
         if (stop < 1 << 30) {
             CHECK_FAILS("collect.stopped", make());
             CHECK(std::filesystem::exists(checkpoint));
@@ -400,9 +402,9 @@ TEST(trainings_have_the_published_levels_and_sizes) {
 TEST(shipped_policies_have_the_published_returns) {
     Tape<float> tape(one_thread());
     for (const char* name : {"hopper", "walker2d", "halfcheetah", "ant"}) {
-        sac::SavedPolicy policy = embedded_policy(std::string(name) + "-medium");
+        sac::Network<float> policy = embedded_policy(std::string(name) + "-medium");
         LiveTask environment(task_of(name));
-        const Moments returns = sampled_returns(tape, policy.network, environment, test_seed(), data_set_episodes, 10);
+        const Moments returns = sampled_returns(tape, policy, environment, test_seed(), data_set_episodes, 10);
         const double level = medium_return(task_of(name));
         CHECK_CLOSE(returns.mean(), level, 0.1 * level + 3 * returns.deviation() / std::sqrt(returns.count));
     }
@@ -455,8 +457,8 @@ TEST(a_replay_set_has_d4rls_layout) {
     const Scratch scratch("layout");
     const MujocoTask& task = task_of("hopper");
     const std::string path = scratch / "hopper_medium_replay-v2.hdf5";
-    collect_medium_replay(path, task, 500, {"test", test_seed()}, small_training(task, 500), scratch / "checkpoint",
-                          {});
+    collect_medium_replay(path, task, 500, {"test", test_seed()}, small_training(task, 500), one_thread(),
+                          scratch / "checkpoint", {});
     const Hdf5File file = open_hdf5(path);
     for (const char* name : {"observations", "next_observations", "actions", "rewards", "infos/qpos", "infos/qvel"}) {
         CHECK(file.find(name) && file.find(name)->shape[0] == 500);
@@ -469,7 +471,7 @@ TEST(a_replay_set_has_d4rls_layout) {
     const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     const DataSetStatistics s = statistics_of(rows, trajectories);
     CHECK(s.left_out == 0 && s.jumps == 0 && s.repeated == 0);
-    const sac::SavedPolicy policy = sac::load_policy(path + ".policy.safetensors");
+    const sac::Network<float> policy = sac::policy_of(read_safetensors(path + ".policy.safetensors"));
     check_policy(policy, 11, 3);
     CHECK_FAILS("collect.policy", check_policy(policy, 17, 6));
 }
@@ -479,8 +481,8 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     const MujocoTask& task = task_of("ant");
     const std::string path = scratch / "ant_medium-v2.hdf5";
     const sac::Network<float> network(27, 256, 16, 0.1, test_seed(), 0);
-    collect_medium(path, task, 1200, {"test", test_seed()}, {network, {}}, [](size_t) {});
-    CHECK_FAILS("collect.policy", collect_medium(path, task_of("hopper"), 10, {"", 0}, {network, {}}, [](size_t) {}));
+    collect_medium(path, task, 1200, {"test", test_seed()}, network, [](size_t) {});
+    CHECK_FAILS("collect.policy", collect_medium(path, task_of("hopper"), 10, {"", 0}, network, [](size_t) {}));
     const Hdf5File file = open_hdf5(path);
     const Rows rows = read_rows(file);
     CHECK(rows.count == 1200 && rows.state_dim == 111);
@@ -572,7 +574,7 @@ TEST(a_collected_file_says_how_it_was_made_and_shows_its_progress) {
     collect("maze2d-umaze-v1", "new/folder/maze.hdf5");
     collect("hopper-medium-v2", "hopper.hdf5");
     const std::string policy = scratch / "policy.safetensors";
-    sac::save_policy(policy, {sac::Network<float>(11, 16, 6, 0.1, test_seed(), 0), {}});
+    sac::save_policy(policy, sac::Network<float>(11, 16, 6, 0.1, test_seed(), 0));
     collect("hopper-medium-v2", "other.hdf5", policy);
     CHECK(read_file(scratch / "hopper.hdf5") != read_file(scratch / "other.hdf5"));
     CHECK_FAILS("collect.task", collect("lunar-lander-v2", "x.hdf5"));

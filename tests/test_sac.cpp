@@ -82,6 +82,9 @@ struct Tiny {
     sac::Batch<double> batch(Tape<double>& tape) const {
         return sac::gather(tape, replay, rows, [](uint32_t i) { return size_t{i}; });
     }
+    sac::Sample<double> sample(Tape<double>& tape, Tensor<double> states) {
+        return sac::draw(tape, states, sac::forward(tape, policy, states), noise.data());
+    }
 };
 
 using Loss = std::function<Tensor<double>(Tape<double>&)>;
@@ -164,7 +167,7 @@ TEST(sac_density_of_actions_integrates_to_one) {
     for (const auto& [mean, log_std] : settings) {
         constexpr int n = 40001;
         Tape<double> tape(one_thread());
-        const Tensor<double> output = sac::input(tape, n, 2);
+        const Tensor<double> output = tape.make(n, 2);
         std::vector<float> noise;
         for (ptrdiff_t i = 0; i < n; ++i) {
             output.value[2 * i] = mean;
@@ -172,10 +175,10 @@ TEST(sac_density_of_actions_integrates_to_one) {
             noise.push_back(static_cast<float>(-9 + 18.0 * static_cast<double>(i) / (n - 1)));
         }
         tape.recording = false;
-        const sac::Sample<double> sample = sac::draw(tape, output, noise.data());
+        const sac::Sample<double> sample = sac::draw(tape, {}, output, noise.data());
         double integral = 0;
         for (ptrdiff_t i = 1; i < n; ++i)
-            integral += (sample.action.value[i] - sample.action.value[i - 1]) *
+            integral += (sample.pairs.value[i] - sample.pairs.value[i - 1]) *
                         (std::exp(sample.log_prob.value[i]) + std::exp(sample.log_prob.value[i - 1])) / 2;
         CHECK_CLOSE(integral, 1, 2e-5);
     }
@@ -185,16 +188,16 @@ TEST(sac_log_probability_agrees_with_the_density_of_a_given_action) {
     constexpr int n = 50;
     Draws draws{2};
     Tape<double> tape(one_thread());
-    const Tensor<double> output = sac::input(tape, n, 6);
+    const Tensor<double> output = tape.make(n, 6);
     for (size_t i = 0; i < output.size(); ++i)
         output.value[i] = 0.4 * static_cast<double>(draws.normal()) - (i % 6 < 3 ? 0 : 1);
     const auto noise = draws.normals(3 * n);
     tape.recording = false;
-    const sac::Sample<double> sample = sac::draw(tape, output, noise.data());
+    const sac::Sample<double> sample = sac::draw(tape, {}, output, noise.data());
     for (ptrdiff_t i = 0; i < n; ++i) {
         double expected = 0;
         for (ptrdiff_t j = 0; j < 3; ++j) {
-            const double a = sample.action.value[3 * i + j], std = std::exp(output.value[6 * i + 3 + j]),
+            const double a = sample.pairs.value[3 * i + j], std = std::exp(output.value[6 * i + 3 + j]),
                          z = (std::atanh(a) - output.value[6 * i + j]) / std;
             expected += -z * z / 2 - std::log(std) - half_log_2_pi - std::log(1 - a * a);
         }
@@ -207,11 +210,11 @@ TEST(sac_standard_deviations_are_clamped_and_the_extremes_are_finite) {
     const float outputs[] = {0.5f, -30, 0.5f, 5, 40, 2, -40, -20}, noise[] = {1, 1, 1, -1};
     Tensor<float> output = tape.make(4, 2);
     std::copy_n(outputs, 8, output.value);
-    const sac::Sample<float> sample = sac::draw(tape, output, noise);
-    CHECK_CLOSE(sample.action.value[0], std::tanh(0.5), 1e-6);  // std exp(-20)
-    CHECK_CLOSE(sample.action.value[1], std::tanh(0.5 + std::exp(2)), 1e-6);
-    CHECK_EQUAL(sample.action.value[2], 1.0f);
-    CHECK_EQUAL(sample.action.value[3], -1.0f);
+    const sac::Sample<float> sample = sac::draw(tape, {}, output, noise);
+    CHECK_CLOSE(sample.pairs.value[0], std::tanh(0.5), 1e-6);  // std exp(-20)
+    CHECK_CLOSE(sample.pairs.value[1], std::tanh(0.5 + std::exp(2)), 1e-6);
+    CHECK_EQUAL(sample.pairs.value[2], 1.0f);
+    CHECK_EQUAL(sample.pairs.value[3], -1.0f);
     const float ones[] = {1, 1, 1, 1};
     tape.backward(weighted_sum(tape, sample.log_prob, ones));
     for (size_t i = 0; i < 8; ++i) CHECK(std::isfinite(output.grad()[i]));
@@ -240,15 +243,14 @@ TEST(sac_gradient_of_the_policy_loss_equals_central_differences) {
     Tiny tiny;
     const Loss loss = [&](Tape<double>& tape) {
         const auto batch = tiny.batch(tape);
-        const auto sample = sac::draw(tape, sac::forward(tape, tiny.policy, batch.states), tiny.noise.data());
-        return sac::policy_loss(tape, tiny.critics, batch.states, sample, 0.3);
+        return sac::policy_loss(tape, tiny.critics, tiny.sample(tape, batch.states), 0.3);
     };
     Tape<double> tape(one_thread());
-    const auto sample = sac::draw(tape, sac::forward(tape, tiny.policy, tiny.batch(tape).states), tiny.noise.data());
+    const auto sample = tiny.sample(tape, tiny.batch(tape).states);
     std::vector<double> q0, excess;  // of the first critic over the second
     for (size_t i = 0; i < Tiny::rows; ++i) {
-        std::vector<double> x(tiny.replay.row(i), tiny.replay.row(i) + 3);
-        x.insert(x.end(), sample.action.value + 2 * i, sample.action.value + 2 * i + 2);
+        const std::vector<double> x(sample.pairs.value + 5 * i, sample.pairs.value + 5 * (i + 1));
+        CHECK(std::equal(x.begin(), x.begin() + 3, tiny.replay.row(i)));
         q0.push_back(plain_forward(tiny.critics[0], x)[0]);
         excess.push_back(q0.back() - plain_forward(tiny.critics[1], x)[0]);
     }
@@ -269,7 +271,7 @@ TEST(sac_gradient_of_the_policy_loss_equals_central_differences) {
 
 TEST(sac_gradient_of_the_temperature_loss_equals_central_differences) {
     Tape<double> tape(one_thread());
-    const Tensor<double> log_prob = sac::input(tape, 5, 1);
+    const Tensor<double> log_prob = tape.make(5, 1);
     for (ptrdiff_t i = 0; i < 5; ++i) log_prob.value[i] = static_cast<double>(i) - 1.25;  // mean 0.75
     Parameter<double> log_alpha{"log_alpha", {1}, {0.4}, {0.0}};
     CHECK_CLOSE(sac::temperature_loss(log_alpha, log_prob, -3.0), -0.4 * (0.75 - 3), 1e-12);
@@ -312,7 +314,7 @@ TEST(sac_targets_after_n_soft_updates_have_their_closed_form) {
     std::vector<float> value = {1, -2, 0.5f}, target = {0, 3, 0.5f};
     const std::vector<float> start = target;
     const int n = 400;
-    for (int i = 0; i < n; ++i) sac::soft_update(target.data(), value.data(), target.size(), 5e-3f);
+    for (int i = 0; i < n; ++i) sac::soft_update(target, value, 5e-3f);
     for (size_t i = 0; i < target.size(); ++i)
         CHECK_CLOSE(target[i], value[i] + (start[i] - value[i]) * std::pow(1 - 5e-3, n), n * 3e-7);
 }
@@ -362,13 +364,24 @@ struct Bandit : Environment {
     std::unique_ptr<Environment> clone() const override { return std::make_unique<Bandit>(*this); }
 };
 
+// An episode with the policy's mean actions.
+Episode play_mean(sac::Learner& learner, Environment& environment, uint64_t number) {
+    return play(environment, {test_seed(), Stream::environment}, number, [&](const Episode& episode) {
+        const std::vector<float> noise(learner.spec.action_dim);
+        std::vector<float> action(noise.size());
+        sac::act(learner.acting, learner.policy, episode.state.data(), noise.data(), action.data());
+        return action;
+    });
+}
+
 // Mean return of `count` episodes of the learner's policy, numbered from first_episode, leaving out those in which the
 // simulation broke down.
 double evaluate(sac::Learner& learner, Environment& environment, uint64_t first_episode, uint64_t count, bool sampled) {
-    sac::Actor actor{learner.acting, learner.policy, test_seed(), sampled};
     double total = 0, sound = 0;
     for (uint64_t i = 0; i < count; ++i) {
-        const Episode episode = actor.play(environment, first_episode + i);
+        const Episode episode =
+            sampled ? sac::play_sampled(learner.acting, learner.policy, environment, test_seed(), first_episode + i)
+                    : play_mean(learner, environment, first_episode + i);
         if (!episode.error.empty()) continue;
         total += episode.total_reward;
         sound += 1;
@@ -615,7 +628,7 @@ TEST(sac_checkpoint_of_another_run_is_refused) {
     elsewhere.limit = 5;
     same.state[0] += 1;  // as if the environment went another way
     CHECK_FAILS("sac.resume", same.resume(elsewhere));
-    sac::save_policy(file.path, {learner.policy, {}});
+    sac::save_policy(file.path, learner.policy);
     CHECK_FAILS("safetensors.missing", sac::load_checkpoint(file.path, same, "task=line"));
 }
 
@@ -625,8 +638,8 @@ TEST(sac_checkpoint_of_another_run_is_refused) {
 TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     TemporaryFile file("policy");
     const sac::Network<float> network(11, 256, 6, 0.05, test_seed(), 0);
-    sac::save_policy(file.path,
-                     {network, {{"task", "hopper"}, {"physics", "d4rl"}, {"return", "1422.1"}, {"steps", "7"}}});
+    sac::save_policy(file.path, network,
+                     {{"task", "hopper"}, {"physics", "d4rl"}, {"return", "1422.1"}, {"steps", "7"}});
     const TensorFile raw = read_safetensors(file.path);
     CHECK_EQUAL(raw.tensors.size(), size_t{8});
     const std::vector<float> fc0 = raw.get<float>("fc0.weight", {256, 11}), fc1 = raw.get<float>("fc1.bias", {256});
@@ -638,11 +651,11 @@ TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     CHECK_EQUAL(raw.text("return"), "1422.1");
     CHECK_EQUAL(raw.text("output_distribution"), "tanh_gaussian");
 
-    sac::SavedPolicy loaded = sac::load_policy(file.path);
-    CHECK_EQUAL(loaded.metadata.at("task"), "hopper");
+    CHECK_EQUAL(raw.text("task"), "hopper");
+    sac::Network<float> loaded = sac::policy_of(raw);
     for (size_t i = 0; i < 6; ++i) {
-        CHECK(loaded.network.parameters[i].value == network.parameters[i].value);
-        CHECK(loaded.network.parameters[i].shape == network.parameters[i].shape);
+        CHECK(loaded.parameters[i].value == network.parameters[i].value);
+        CHECK(loaded.parameters[i].shape == network.parameters[i].shape);
     }
 
     // Mean and log standard deviation as a reader of the file would compute them.
@@ -651,7 +664,7 @@ TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     const std::vector<double> output = plain_forward(network, {state.begin(), state.end()});
     Tape<float> tape(one_thread());
     float action[3];
-    const float log_prob = sac::act(tape, loaded.network, state.data(), noise.data(), action);
+    const float log_prob = sac::act(tape, loaded, state.data(), noise.data(), action);
     double expected = 0;
     for (size_t j = 0; j < 3; ++j) {
         const double z = static_cast<double>(noise[j]), a = std::tanh(output[j] + std::exp(output[3 + j]) * z);
@@ -671,32 +684,32 @@ TEST(sac_policy_file_that_is_none_is_refused) {
     other.add("fc0.weight", {2}, std::vector<float>{1, 2});
     other.add("last_fc.weight", {1, 2}, std::vector<float>{1, 2});
     write_safetensors(file.path, other);
-    CHECK_FAILS("sac.policy", sac::load_policy(file.path));
+    CHECK_FAILS("sac.policy", sac::policy_of(read_safetensors(file.path)));
     write_safetensors(file.path, TensorFile{});
-    CHECK_FAILS("safetensors.missing", sac::load_policy(file.path));
-    sac::save_policy(file.path, {sac::Network<float>(2, 8, 4, 1, 0, 0), {}});
+    CHECK_FAILS("safetensors.missing", sac::policy_of(read_safetensors(file.path)));
+    sac::save_policy(file.path, sac::Network<float>(2, 8, 4, 1, 0, 0));
     std::string bytes = read_file(file.path);
     bytes[bytes.size() - 3] = static_cast<char>(bytes[bytes.size() - 3] ^ 1);
     write_file_atomic(file.path, bytes);
-    CHECK_FAILS("safetensors.checksum", sac::load_policy(file.path));
+    CHECK_FAILS("safetensors.checksum", sac::policy_of(read_safetensors(file.path)));
 }
 
 TEST(sac_played_episode_is_a_function_of_seed_and_number) {
     Rail environment;
     environment.fails_at = 3;
     sac::Learner learner(small_settings(), environment.spec(), one_thread());
-    sac::Actor actor{learner.acting, learner.policy, test_seed()};
-    const Episode a = actor.play(environment, 4);
-    const std::vector<float> log_probs = actor.log_probs;
-    const Episode again = actor.play(environment, 4);
+    std::vector<float> log_probs, log_probs_again;
+    const auto sampled = [&](uint64_t number, std::vector<float>* written = nullptr) {
+        return sac::play_sampled(learner.acting, learner.policy, environment, test_seed(), number, written);
+    };
+    const Episode a = sampled(4, &log_probs), again = sampled(4, &log_probs_again);
     CHECK_EQUAL(a.trajectory.rewards.size(), size_t{5});
     CHECK(a.trajectory.actions == again.trajectory.actions && a.trajectory.states == again.trajectory.states);
-    CHECK(log_probs.size() == 5 && actor.log_probs == log_probs);
-    const Episode failed = actor.play(environment, 5);
+    CHECK(log_probs.size() == 5 && log_probs_again == log_probs);
+    const Episode failed = sampled(5);
     CHECK(!a.trajectory.terminated && a.error.empty() && !failed.error.empty());
     CHECK_EQUAL(failed.trajectory.length(), 3);
-    actor.sampled = false;
-    const Episode mean = actor.play(environment, 4);
+    const Episode mean = play_mean(learner, environment, 4);
     CHECK(a.trajectory.actions != mean.trajectory.actions && a.trajectory.states[0] == mean.trajectory.states[0]);
     double total = 0;
     for (const float reward : a.trajectory.rewards) total += static_cast<double>(reward);
