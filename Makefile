@@ -13,7 +13,7 @@
 #   make clean            remove what was built (runs/ stays)
 
 CXX = g++
-# -O2: nn.hpp and memory.hpp raise it for themselves, wodtem.cpp lowers it for data/. No result depends on the level.
+# -O2: wodtem.cpp raises it for what computes and lowers it for data/. No result depends on the level.
 # -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
 # -fno-math-errno: a square root is an instruction.

@@ -20,9 +20,6 @@
 
 #include "nn.hpp"  // and with it the other standard headers
 
-#pragma GCC push_options
-#pragma GCC optimize("O3")
-
 // The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
 namespace Stream {
 constexpr uint32_t batch = 3;           // step: update; index: window of the batch
@@ -813,5 +810,3 @@ inline double approximate_return(const EpisodicMemory& memory, std::span<const N
     }
     return sum / normaliser;
 }
-
-#pragma GCC pop_options

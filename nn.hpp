@@ -34,10 +34,6 @@
 #include <utility>
 #include <vector>
 
-// Attention and small networks take 1.2 to 1.5 times as long at -O2.
-#pragma GCC push_options
-#pragma GCC optimize("O3")
-
 #if defined(__x86_64__) && !defined(__clang__)
 #define X86_KERNELS  // in AVX2 and AVX-512, beside the portable ones
 #endif
@@ -2101,5 +2097,3 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
     }
     return norm;
 }
-
-#pragma GCC pop_options

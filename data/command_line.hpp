@@ -61,7 +61,7 @@ inline const Option option_table[] = {
     {"check", "-v", nullptr, "", "print inputs, the file's values and the program's"},
     {"check", "--dump", "FILE", "", "write every tensor of one update of a run instead, as a case of topic step"},
     {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
-    {"train eval import bench check", "--kernel", "NAME", "auto",
+    {"train eval import sweep bench check", "--kernel", "NAME", "auto",
      "of matrix products: avx512, avx2, portable; auto: the best there is"},
     {"train eval import sweep bench check", "--precision", "NAME", "fp32",
      "of matrix products: fp32, or bf16, whose sums stay fp32 (avx512, on request portable)"},
@@ -420,6 +420,7 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
     const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
     std::string shared;
     if (arguments.has("--dataset")) shared += " --dataset " + shell_word(arguments["--dataset"]);
+    if (arguments["--kernel"] != "auto") shared += " --kernel " + shell_word(arguments["--kernel"]);
     if (arguments["--precision"] != "fp32") shared += " --precision " + shell_word(arguments["--precision"]);
     for (const std::string& assignment : arguments.assignments) shared += " --set " + shell_word(assignment);
     for (const Settings& settings : sweep)

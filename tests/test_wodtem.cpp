@@ -1472,10 +1472,10 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --out --set alpha=1", 2, "needs a value");
     check_shell("./wodtem train gridworld --seed 1 --seeds 0-4", 2, "choose one");
     check_shell("./wodtem train hoper", 2, "nearest is \"hopper-v2\"");
-    check_shell("./wodtem train hopper --physics 2.3", 2, "none|d4rl|2.2");
-    check_shell("./wodtem train hopper --physics none", 2, "d4rl or 2.2");
+    check_shell("./wodtem train hopper --dataset random --physics 2.3", 2, "none|d4rl|2.2");
+    check_shell("./wodtem train hopper --dataset random --physics none", 2, "d4rl or 2.2");
     check_shell("./wodtem train gridworld --physics 2.2", 2, "cannot have physics");
-    check_shell("./wodtem train hopper --set behaviour=left_down", 2, "it is recorded or random");
+    check_shell("./wodtem train hopper --dataset random --set behaviour=left_down", 2, "it is recorded or random");
     check_shell("./wodtem trace gridworld", 2, "MuJoCo");
     check_shell("./wodtem trace nothing", 2, "nearest is");
     check_shell("./wodtem trace hopper --physics old", 2, "none|d4rl|2.2");
@@ -1507,6 +1507,15 @@ TEST(failures_exit_with_one_and_a_sentence) {
     check_shell("./wodtem train gridworld --out /proc/none", 1, "/proc/none");
     check_shell("(./wodtem tasks > /dev/full)", 1, "stdout");
     check_shell("./wodtem tasks", 0, "gridworld");
+    check_shell("./wodtem train hopper", 1, "--dataset random");
+    check_shell("./wodtem train gridworld --dataset x.hdf5", 2, "makes its own data set");
+    check_shell("./wodtem eval README.md --precision fp16", 2, "--precision");
+    check_shell(
+        "./wodtem sweep hopper --seeds 3 --methods dt --dataset 'my set' --set width=8 --precision bf16 --kernel "
+        "portable",
+        0,
+        "./wodtem train hopper-v2 --method dt --preset small --seed 3 --dataset 'my set' --kernel portable "
+        "--precision bf16 --set width=8\n");
     check_shell("./wodtem sweep --seeds 0-1 --methods odt,wodtem", 0,
                 "train gridworld --method wodtem --preset small --seed 1");
 }
