@@ -22,7 +22,7 @@
 
 // The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
 namespace Stream {
-constexpr uint32_t batch = 3;           // step: update; index: window of the batch
+constexpr uint32_t batch = 3;           // step: update; index: window of the batch; site 1: Draw::uniform's start
 constexpr uint32_t exploration = 4;     // step: episode; site: action dimension; index: time-step
 constexpr uint32_t advised_action = 5;  // eq. (6). step: update; index: window * context_length + step in the window
 constexpr uint32_t entropy_noise = 6;   // the same; site: action dimension
@@ -222,6 +222,11 @@ struct Window {
     int start, length;  // steps; start counts from 0
 };
 
+// How a trajectory is drawn from the buffer: with probability proportional to its length, as DT's and ODT's code, or
+// each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps counts
+// 1 / T, so that short episodes weigh more.
+enum class Draw { by_length, uniform };
+
 struct ReplayBuffer {
     int state_dim, action_dim;
     double gamma;
@@ -258,22 +263,30 @@ struct ReplayBuffer {
             ends.push_back((ends.empty() ? 0 : ends.back()) + static_cast<uint64_t>(trajectory.length()));
     }
 
-    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory is drawn with probability proportional to its
-    // length and a start uniformly from its steps; the window is the next min(context_length, steps left) steps. So
-    // windows that start near the end of a trajectory are short.
+    // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory is drawn, and a start uniformly from its
+    // steps; the window is the next min(context_length, steps left) steps. So windows that start near the end of a
+    // trajectory are short.
     // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
-    // One number drawn from all steps laid end to end has exactly these probabilities, for each step is one start.
-    Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length) const {
+    // by_length: one number drawn from all steps laid end to end has exactly these probabilities, for each step is one
+    // start. uniform: a second number, of site 1, draws the start.
+    Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length, Draw draw) const {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
-        return window_at(random.below(ends.back(), update, window_index), context_length);
+        if (draw == Draw::by_length) return window_at(random.below(ends.back(), update, window_index), context_length);
+        const size_t drawn = random.below(trajectories.size(), update, window_index);
+        const uint64_t length = static_cast<uint64_t>(trajectories[drawn].length());
+        return window_of(drawn, static_cast<int>(random.below(length, update, window_index, 1)), context_length);
     }
 
     // The window that starts at a step, 0 <= step < ends.back(), of all trajectories laid end to end.
     Window window_at(uint64_t step, int context_length) const {
         const auto end = std::upper_bound(ends.begin(), ends.end(), step);  // the first trajectory to end after `step`
-        const int left = static_cast<int>(*end - step);
         const auto trajectory = static_cast<size_t>(end - ends.begin());
-        return {trajectory, trajectories[trajectory].length() - left, std::min(context_length, left)};
+        return window_of(trajectory, trajectories[trajectory].length() - static_cast<int>(*end - step), context_length);
+    }
+
+    // The window that starts at a step of the trajectory in a place of the buffer.
+    Window window_of(size_t trajectory, int start, int context_length) const {
+        return {trajectory, start, std::min(context_length, trajectories[trajectory].length() - start)};
     }
 };
 

@@ -220,10 +220,11 @@ struct Batch {
 Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
     const Agent& agent = run.agent;
     const uint32_t context_length = static_cast<uint32_t>(agent.settings.context_length);
+    const Draw draw = agent.settings.sampling == "uniform" ? Draw::uniform : Draw::by_length;
     Batch batch;
     for (uint32_t window = first; window < end; ++window) {
         const Window at = run.replay.sample(agent.random(Stream::batch), run.progress.updates, window,
-                                            static_cast<int>(context_length));
+                                            static_cast<int>(context_length), draw);
         // g_t and d_t were computed when the trajectory entered the buffer (relabel): they do not depend on the window.
         const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
         batch.sequences.lengths.push_back(at.length);

@@ -63,7 +63,7 @@ inline const Option option_table[] = {
     {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
     {"train eval import sweep bench check", "--kernel", "NAME", "auto",
      "of matrix products: avx512, avx2, portable; auto: the best there is"},
-    {"train eval import sweep bench check", "--precision", "NAME", "fp32",
+    {"train eval import sweep check", "--precision", "NAME", "fp32",
      "of matrix products: fp32, or bf16, whose sums stay fp32 (avx512, on request portable)"},
     {"train eval collect bench check", "--threads", "N", "0",
      "worker threads; 0: one per core, in train one alone for a small network; results do not depend on it"},
@@ -259,7 +259,8 @@ inline int thread_count(const Arguments& arguments, const Settings& settings) {
 // The kernel of --kernel and --precision. "auto" never chooses the imitation of bf16 in portable code. Errors:
 // usage.kernel names the kernels of this machine.
 inline const Kernel& kernel_of(const Arguments& arguments) {
-    const std::string &name = arguments["--kernel"], &precision = arguments["--precision"];
+    const std::string &name = arguments["--kernel"],
+                      precision = arguments.options.contains("--precision") ? arguments["--precision"] : "fp32";
     std::string available;
     for (const Kernel* kernel : kernels) {
         if (!kernel->supported()) continue;

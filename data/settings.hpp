@@ -132,6 +132,7 @@ struct Settings {
     int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
     double g_online = 2, g_eval = 1, reward_scale = 1;
     bool keep_lowest = false;
+    std::string sampling = "by_length";
 
     double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
     int64_t K = 1, projected_dim = 0, table_size = 36;
@@ -207,6 +208,7 @@ inline const SettingRow setting_rows[] = {
     {"g_eval", &Settings::g_eval, -many, many, "", "WODTEM Table I: g_eval"},
     {"reward_scale", &Settings::reward_scale, 1e-9, 1e9, "", "chosen: ODT's 0.001 would leave no signal"},
     {"keep_lowest", &Settings::keep_lowest, 0, 0, "", "ODT's code: drops the lowest-return offline trajectory"},
+    {"sampling", &Settings::sampling, 0, 0, "by_length|uniform", "DT's and ODT's code: trajectories by their length"},
     // Episodic memory.
     {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
     {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},

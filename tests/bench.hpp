@@ -330,7 +330,7 @@ void bench_update(Measurements& measured, const Kernel& kernel, int threads, con
     const int repeats = std::max(1, static_cast<int>(1e9 / operations));
     std::vector<double> seconds, shares;
     update(run);
-    for (int round = 0; round < (operations > 1e11 ? 3 : 7); ++round) {
+    for (int round = 0; round < (operations > 1e11 ? 2 : 7); ++round) {
         seconds.push_back(seconds_of([&] {
                               for (int i = 0; i < repeats; ++i) update(run);
                           }) /
@@ -420,9 +420,13 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
 
 void bench_all(const std::string& kernel_name, int threads, bool json) {
     Measurements measured{json, {}};
-    std::vector<const Kernel*> chosen;
-    for (const Kernel* kernel : kernels)
-        if (kernel->supported() && (kernel_name == "auto" || kernel_name == kernel->name)) chosen.push_back(kernel);
+    std::vector<const Kernel*> chosen;  // the best of each precision, or those of the name
+    for (const Kernel* kernel : kernels) {
+        const auto alike = [=](const Kernel* other) { return !std::strcmp(other->precision, kernel->precision); };
+        const bool best = kernel != &kernel_portable_bf16 && std::ranges::none_of(chosen, alike);
+        if (kernel->supported() && (kernel_name == "auto" ? best : kernel_name == kernel->name))
+            chosen.push_back(kernel);
+    }
     if (!json) std::printf("medians (and ranges); a share of the peak is of the peak of its own moment\n");
     for (const Kernel* kernel : chosen) {
         double peak = 0;
@@ -436,7 +440,7 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
     std::vector<double> rates;
     for (const Kernel* kernel : chosen) rates.push_back(bench_products(measured, *kernel, threads));
     bench_other_kernels(measured, *chosen[0], threads, bandwidth);
-    bench_updates(measured, *chosen[0], threads, {rates[0], bandwidth});  // others are slower in proportion
+    for (size_t i = 0; i < chosen.size(); ++i) bench_updates(measured, *chosen[i], threads, {rates[i], bandwidth});
     rusage use{};
     getrusage(RUSAGE_SELF, &use);
     if (!json) std::printf("peak memory so far: %ld MB\n", use.ru_maxrss / 1024);

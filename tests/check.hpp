@@ -1413,18 +1413,26 @@ void check_sampling(Case& c) {
     for (const Trajectory& trajectory : buffer.trajectories) order.push_back(static_cast<int>(trajectory.states[0]));
     c.expect("order", {order.size()}, order);
     if (!c.has("in/draws")) return;
-    const auto draws =
-        c.whole_in("draws", {any}, 0, buffer.ends.empty() ? -1 : static_cast<int64_t>(buffer.ends.back()) - 1);
+    const bool uniform = c.word("sampling", "by_length|uniform") == "uniform";
+    const auto draws = c.whole_in("draws", uniform ? Shape{any, 2} : Shape{any}, 0,
+                                  buffer.ends.empty() ? -1 : static_cast<int64_t>(buffer.ends.back()) - 1);
+    const Shape windows = {draws.shape[0]};
     std::vector<int> trajectory, start, length;
-    for (const int64_t draw : draws.values) {
-        const Window window = buffer.window_at(static_cast<uint64_t>(draw), context_length);
+    for (size_t i = 0; i < windows[0]; ++i) {
+        if (uniform && (draws.values[2 * i] >= static_cast<int64_t>(count) ||
+                        draws.values[2 * i + 1] >= buffer.trajectories[draws.values[2 * i]].length()))
+            fail("check.value", "%s: case %s: draw %zu names no step of the buffer", c.file.path.c_str(),
+                 c.name.c_str(), i);
+        const Window window =
+            uniform ? buffer.window_of(draws.values[2 * i], static_cast<int>(draws.values[2 * i + 1]), context_length)
+                    : buffer.window_at(static_cast<uint64_t>(draws.values[i]), context_length);
         trajectory.push_back(static_cast<int>(window.trajectory));
         start.push_back(window.start);
         length.push_back(window.length);
     }
-    c.expect("trajectory", draws.shape, trajectory);
-    c.expect("start", draws.shape, start);
-    c.expect("length", draws.shape, length);
+    c.expect("trajectory", windows, trajectory);
+    c.expect("start", windows, start);
+    c.expect("length", windows, length);
 }
 
 // Two kinds: states [n, S] -> mean, deviation [S], normalised [n, S]; returns [m] and metadata CASE.task -> score [m].

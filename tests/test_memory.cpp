@@ -387,15 +387,16 @@ TEST(replay_starts_from_low_to_high_return_and_overwrites_from_the_lowest) {
 TEST(replay_samples_every_step_alike_and_cuts_windows_at_the_end) {
     ReplayBuffer replay{.state_dim = 1, .action_dim = 1, .gamma = gamma_dr, .capacity = 4};
     const Random random{test_seed(), Stream::batch};
-    CHECK_FAILS("replay.empty", replay.sample(random, 0, 0, 5));
+    CHECK_FAILS("replay.empty", replay.sample(random, 0, 0, 5, Draw::by_length));
     replay.start({with_return(7, 1)});
-    for (uint32_t i = 0; i < 50; ++i) CHECK_EQUAL(replay.sample(random, 0, i, 5).trajectory, size_t{0});
+    for (uint32_t i = 0; i < 50; ++i)
+        CHECK_EQUAL(replay.sample(random, 0, i, 5, Draw::by_length).trajectory, size_t{0});
     replay.start({with_return(1, 1), with_return(10, 2), with_return(3, 3), with_return(40, 4)});
     replay.add(with_return(6, 0));  // overwrites the one of length 1: 59 steps
     std::map<std::pair<size_t, int>, int> hits;
     const int draws = 59000;
     for (uint32_t i = 0; i < draws; ++i) {
-        const Window window = replay.sample(random, i / 256, i % 256, 5);
+        const Window window = replay.sample(random, i / 256, i % 256, 5, Draw::by_length);
         const int T = replay.trajectories.at(window.trajectory).length();
         CHECK(window.start >= 0 && window.start < T);
         CHECK_EQUAL(window.length, std::min(5, T - window.start));
@@ -405,6 +406,28 @@ TEST(replay_samples_every_step_alike_and_cuts_windows_at_the_end) {
     for (const auto& [window, count] : hits) chi_square += (count - 1000.0) * (count - 1000.0) / 1000.0;
     CHECK_EQUAL(hits.size(), size_t{59});
     CHECK(chi_square < 58 + 5 * 10.8);  // mean 58, standard deviation sqrt(2 * 58) = 10.8
+}
+
+// WODTEM sec. III-B, C^t test
+TEST(replay_draws_trajectories_alike_where_sampling_is_uniform) {
+    ReplayBuffer replay{.state_dim = 1, .action_dim = 1, .gamma = gamma_dr, .capacity = 4};
+    const Random random{test_seed(), Stream::batch};
+    replay.start({with_return(1, 1), with_return(10, 2), with_return(3, 3), with_return(40, 4)});
+    std::map<std::pair<size_t, int>, int> hits;
+    const int draws = 40000;
+    for (uint32_t i = 0; i < draws; ++i) {
+        const Window window = replay.sample(random, i / 256, i % 256, 5, Draw::uniform);
+        const int T = replay.trajectories.at(window.trajectory).length();
+        CHECK_EQUAL(window.length, std::min(5, T - window.start));
+        ++hits[{window.trajectory, window.start}];
+    }
+    double chi_square = 0;
+    for (const auto& [window, count] : hits) {  // a step of a trajectory of T steps has probability 1 / (4 T)
+        const double expected = draws / 4.0 / replay.trajectories.at(window.first).length();
+        chi_square += (count - expected) * (count - expected) / expected;
+    }
+    CHECK_EQUAL(hits.size(), size_t{54});
+    CHECK(chi_square < 53 + 5 * 10.3);  // mean 53, standard deviation sqrt(2 * 53) = 10.3
 }
 
 // ---- The table
@@ -828,7 +851,8 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
     for (ReplayBuffer* replay : {&saved, &loaded}) replay->add(with_return(9, 4));
     const Random random{test_seed(), Stream::batch};
     for (uint32_t i = 0; i < 100; ++i) {
-        const Window a = saved.sample(random, 0, i, 4), b = loaded.sample(random, 0, i, 4);
+        const Window a = saved.sample(random, 0, i, 4, Draw::uniform),
+                     b = loaded.sample(random, 0, i, 4, Draw::uniform);
         CHECK(a.trajectory == b.trajectory && a.start == b.start && a.length == b.length);
     }
     for (size_t i = 0; i < 3; ++i) {

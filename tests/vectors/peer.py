@@ -1480,8 +1480,8 @@ def sampling():
         steps = [(place, start) for place, i in enumerate(order) for start in range(lengths[i])]
         if draws is None:
             draws = list(range(len(steps)))
-        inputs["draws"] = np.array(draws)
         chosen = [steps[d] for d in draws]
+        inputs["draws"] = np.array(chosen if settings.get("sampling") == "uniform" else draws)
         outputs["trajectory"] = np.array([place for place, _ in chosen])
         outputs["start"] = np.array([start for _, start in chosen])
         outputs["length"] = np.array([min(context_length, lengths[order[place]] - start) for place, start in chosen])
@@ -1505,6 +1505,8 @@ def sampling():
     case("laps", "lap after lap", [1, 2, 3, 4, 5, 6], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [4, 5], initial=2, capacity=2)
     case("drops_lowest", "ODT's code drops the offline trajectory of the lowest return, of several the first",
          [2, 3, 1, 2], [5.0, -1.0, -1.0, 2.0], [2, 3, 0], keep_lowest=0)
+    case("uniform", "trajectories alike: a place of the buffer and a step of its trajectory; windows cut at the end",
+         [4, 1, 6], [2.0, 3.0, 1.0], [2, 0, 1], draws=[0, 3, 5, 6, 9, 10], sampling="uniform")
     f.save()
 
 
