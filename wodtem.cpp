@@ -26,7 +26,6 @@
 
 // What computes is compiled for speed (attention and small networks take 1.2 to 1.5 times as long at -O2); files, words
 // and pictures, in which no loop counts, are compiled quickly.
-#pragma GCC push_options
 #pragma GCC optimize("O3")
 #include "gridworld.hpp"
 #include "memory.hpp"
@@ -44,7 +43,7 @@
 #include "data/settings.hpp"
 #include "data/state.hpp"
 #include "tests/trace.hpp"
-#pragma GCC pop_options
+#pragma GCC optimize("O2")
 
 // ---------------------------------------------------------------------------------------------------------------------
 // State. Everything that changes during a run lies in plain structs, so that a checkpoint can list it. S and A stand
@@ -971,11 +970,9 @@ void command_report(const Arguments& arguments) {
 }
 
 // `bench` and `check` measure and judge the functions above, so they are included behind them.
-#pragma GCC push_options
 #pragma GCC optimize("O1")
 #include "tests/bench.hpp"
 #include "tests/check.hpp"
-#pragma GCC pop_options
 
 const Command commands[] = {
     {"train", "TASK", 1, 1, "offline phase, online phase, evaluations; continues what is there", command_train,
