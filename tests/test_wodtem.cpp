@@ -1509,7 +1509,7 @@ TEST(failures_exit_with_one_and_a_sentence) {
     check_shell("./wodtem tasks", 0, "gridworld");
     check_shell("./wodtem train hopper", 1, "--dataset random");
     check_shell("./wodtem train gridworld --dataset x.hdf5", 2, "makes its own data set");
-    check_shell("./wodtem eval README.md --precision fp16", 2, "--precision");
+    check_shell("./wodtem sweep --precision fp16", 2, "--precision");
     check_shell(
         "./wodtem sweep hopper --seeds 3 --methods dt --dataset 'my set' --set width=8 --precision bf16 --kernel "
         "portable",
