@@ -44,9 +44,8 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
         if (!archive.loading) continue;
         require_finite(name + ".value." + parameter, parameters[i].value);
         require_finite(name + ".first_moment." + parameter, optimizer.first_moment[i]);
-        require_finite(name + ".second_moment." + parameter, optimizer.second_moment[i]);
-        for (const float value : optimizer.second_moment[i])
-            require_entry(value >= 0, name + ".second_moment." + parameter, "holds a negative number");
+        for (const float value : optimizer.second_moment[i])  // a sum of squares, which may have become infinite
+            require_entry(value >= 0, name + ".second_moment." + parameter, "holds a number that is not 0 or more");
     }
 }
 
