@@ -174,10 +174,14 @@ class Threads {
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
     // f must not throw and must not call run(). `serial`: the calling thread runs all tasks alone.
+    // Errors: nn.stopped, as soon as asked_to_stop() says yes; the tasks that no thread has begun are then left out.
     template <class F>
     void run(int tasks, F&& f, bool serial = false) {
         if (serial || workers_.empty() || tasks < 2) {
-            for (int task = 0; task < tasks; ++task) f(task, 0);
+            for (int task = 0; task < tasks; ++task) {
+                if (asked_to_stop && asked_to_stop()) fail_stopped();
+                f(task, 0);
+            }
             return;
         }
         {
@@ -189,11 +193,15 @@ class Threads {
             ++jobs_;
         }
         wake_.notify_all();
-        take_tasks(0);
+        const bool stopped = take_tasks(0);
         poll([this] { return unfinished_ == 0; });
         std::unique_lock lock(mutex_);
         done_.wait(lock, [this] { return unfinished_ == 0; });
+        if (stopped) fail_stopped();
     }
+
+    // Set where work may be abandoned; run() calls it before each task of the calling thread.
+    std::function<bool()> asked_to_stop;
 
   private:
     // Waits until condition() holds, but for some ten microseconds at most. To be woken by the system takes about as
@@ -207,17 +215,25 @@ class Threads {
         }
     }
 
+    [[noreturn]] static void fail_stopped() { fail("nn.stopped", "the computation was stopped on request"); }
+
     // Runs tasks of the current job until none is left. The job itself changes only after all its tasks are finished,
-    // so it is read without the lock.
-    void take_tasks(int worker) {
+    // so it is read without the lock. Returns whether the others were given up because someone asked to stop.
+    bool take_tasks(int worker) {
         std::unique_lock lock(mutex_);
         while (next_task_ < tasks_) {
+            if (worker == 0 && asked_to_stop && asked_to_stop()) {
+                unfinished_ -= tasks_ - next_task_;
+                next_task_ = tasks_;
+                return true;
+            }
             const int task = next_task_++;
             lock.unlock();
             job_(task, worker);
             lock.lock();
             if (--unfinished_ == 0) done_.notify_one();
         }
+        return false;
     }
 
     void work(int worker) {
@@ -631,22 +647,29 @@ struct Compute {
     Threads threads;
     Buffer packed_b;
     PackedWeights packed_weights;
-    std::vector<Buffer> scratch;  // one per worker, for a task: a block of A in panels, a head's rows
-    Buffer sums;                  // of block_sums
+    std::vector<Buffer> scratch;               // one per worker, for a task: a block of A in panels, a head's rows
+    Buffer sums;                               // of block_sums
+    std::function<bool()> asked_to_stop = {};  // see FrozenWeights
     Compute(const Kernel& chosen, int thread_count)
         : kernel(chosen),
           threads(thread_count),
           scratch(static_cast<size_t>(thread_count)) {}
 };
 
-// While one lives, no weight may change (View::weight): products pack each weight once and use its panels again.
+// While one lives, no weight may change (View::weight): products pack each weight once and use its panels again. As long
+// as no weight changes work can be abandoned without loss, so Compute::asked_to_stop holds then: Threads::run() fails
+// with nn.stopped once it says yes.
 struct FrozenWeights {
-    PackedWeights& packed;
-    explicit FrozenWeights(Compute& compute) : packed(compute.packed_weights) {
-        for (auto& [key, entry] : packed.entries) entry.valid = false;
-        packed.frozen = true;
+    Compute& compute;
+    explicit FrozenWeights(Compute& c) : compute(c) {
+        for (auto& [key, entry] : compute.packed_weights.entries) entry.valid = false;
+        compute.packed_weights.frozen = true;
+        compute.threads.asked_to_stop = compute.asked_to_stop;
     }
-    ~FrozenWeights() { packed.frozen = false; }
+    ~FrozenWeights() {
+        compute.packed_weights.frozen = false;
+        compute.threads.asked_to_stop = nullptr;
+    }
     FrozenWeights(const FrozenWeights&) = delete;
     FrozenWeights& operator=(const FrozenWeights&) = delete;
 };

@@ -149,8 +149,38 @@ struct Run {
     }
 };
 
+// Refuses counts that the schedule of the phases (below) does not lead to. Errors: checkpoint.entry.
+void check_progress(Run& run) {
+    const Progress& p = run.progress;
+    const Settings& settings = run.agent.settings;
+    const auto count = [](int64_t setting) { return static_cast<uint64_t>(setting); };  // none exceeds 1e9
+    const uint64_t offline = count(settings.offline_updates), each = count(settings.updates_per_iteration);
+    const uint64_t every = count(settings.eval_every), budget = count(settings.online_steps);
+    const bool online = p.online == 1;
+    require_entry(p.online <= (budget > 0 ? 1u : 0u), "progress.online", "names no phase of this run");
+    // An episode begins below the budget and has a step or more.
+    const uint64_t most = online ? budget + count(run.agent.spec.max_episode_steps) - 1 : 0;
+    require_entry(p.interactions <= most, "progress.interactions", "is more than this phase makes");
+    require_entry(p.episodes <= p.interactions, "progress.episodes", "exceeds progress.interactions");
+    // An episode begins when the updates of those before it are made.
+    const uint64_t due = offline + p.episodes * each;
+    require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
+                  "does not fit progress.episodes");
+    require_entry(p.evaluations <= (online ? 1 + p.episodes / every : 0) && (!online || p.evaluations >= 1),
+                  "progress.evaluations", "does not fit progress.episodes");
+    require_entry(p.next_evaluation == p.evaluations * every && p.next_evaluation >= p.episodes,
+                  "progress.next_evaluation", "does not fit progress.evaluations and progress.episodes");
+    require_entry(!std::isinf(p.eval_length), "progress.eval_length", "is infinite");
+    require_entry(!std::isinf(p.eval_return), "progress.eval_return", "is infinite");
+    const auto require_sum = [](const char* name, double sum) { require_finite(name, std::array{sum}); };
+    run.tally.visit(require_sum);
+    require_entry(run.optimizer.updates == p.updates, "model.updates", "is not progress.updates");
+    require_entry(run.agent.temperature.optimizer.updates == (run.agent.constrains_entropy() ? p.updates : 0),
+                  "temperature.updates", "is not progress.updates, or 0 where the entropy is not constrained");
+}
+
 // Names every part of the state once; saving and loading call it with their archive, which writes a field under its
-// name or reads it back. Errors of loading: model.value, checkpoint.replay, checkpoint.memory, safetensors.*.
+// name or reads it back. Errors of loading: checkpoint.entry, safetensors.*.
 template <class Archive>
 void visit_state(Archive& archive, Run& run) {
     Progress& p = run.progress;
@@ -168,9 +198,17 @@ void visit_state(Archive& archive, Run& run) {
     const size_t state_dim = run.agent.spec.state_dim;  // which loading demands of these two
     archive("normaliser.mean", run.agent.normaliser.mean, state_dim);
     archive("normaliser.deviation", run.agent.normaliser.deviation, state_dim);
-    if (archive.loading) check_model(contents_of(run.agent), "the state");
-    if (p.online != 0) visit_replay(archive, run.replay);  // in the offline phase it is the data set
-    visit_memory(archive, run.memory);
+    if (archive.loading) {
+        require_finite("temperature.value.log_temperature", std::array{run.agent.temperature.lambda()});
+        require_finite("normaliser.mean", run.agent.normaliser.mean);
+        require_finite("normaliser.deviation", run.agent.normaliser.deviation);
+        for (const float deviation : run.agent.normaliser.deviation)
+            require_entry(deviation > 0, "normaliser.deviation", "holds a number that is not positive");
+        check_progress(run);
+    }
+    const int moves = run.agent.spec.discrete_actions;
+    if (p.online != 0) visit_replay(archive, run.replay, moves);  // in the offline phase it is the data set
+    visit_memory(archive, run.memory, moves);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -212,6 +250,7 @@ struct Batch {
     std::vector<float> weights;              // [n] w(s_c, a_c)
     std::vector<uint32_t> random_index;      // [n] window * context_length + step: index of a step's random numbers
     Neighbourhoods neighbours;               // [n] K(s_c)
+    double short_pairs = 0;                  // steps with d_c < e-hat
 };
 
 // WODTEM sec. IV-B.3, step 1: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}, d_{-C,t}) from the replay buffer: windows
@@ -261,31 +300,39 @@ void append_memory_key(std::vector<float>& to, const Agent& agent, const float* 
 
 // WODTEM sec. IV-B.3, step 2: looks up each s_c in Q; weighs (s_c, a_c) by eq. (7) and, where it falls short, draws
 // a-hat(s_c) by eq. (6), anew in each batch. A state without a neighbour has w = 1: there is nothing to compare with.
-void consult_memory(Run& run, Batch& batch) {
+// Changes nothing but the batch; count_lookups() is for later.
+void consult_memory(const Run& run, Batch& batch) {
     const Agent& agent = run.agent;
     if (!agent.uses_memory()) return;
     const Random random = agent.random(Stream::advised_action);
     std::vector<float> keys;  // [n, state_dim]
     for (const float* state : batch.raw_states) append_memory_key(keys, agent, state);
-    // All look-ups come first. Counting accesses changes no distance, so the order of the two does not matter to them.
     batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
-    run.tally.pairs += static_cast<double>(batch.raw_states.size());
     for (size_t i = 0; i < batch.raw_states.size(); ++i) {
         const std::span<const Neighbour> found = batch.neighbours[i];
-        run.memory.count_accesses(found);  // every neighbour counts, whether or not it is followed
-        run.tally.unmatched_pairs += found.empty();
         // Q has taken in all of D, this step too. So, unless the table has forgotten it or exclude_self is set, s_c is
         // as a rule its own first neighbour, at distance 0, and has e >= d_c there.
         const bool optimal = run.memory.is_optimal(found, batch.discounted_returns[i]);  // eq. (5)
         batch.weights[i] = static_cast<float>(EpisodicMemory::weight(optimal, agent.settings.alpha));
         if (optimal) continue;
-        run.tally.short_pairs += 1;
+        batch.short_pairs += 1;
         const double uniform = random.uniform(run.progress.updates, batch.random_index[i]);
         const float* advised = run.memory.advised_action(found, uniform);  // eq. (6)
         for (int j = 0; j < agent.spec.action_dim; ++j)
             batch.advised_actions[i * agent.spec.action_dim + j] =
                 agent.discrete() ? advised[j] : clamp_action(advised[j]);
     }
+}
+
+// What a batch's look-ups change in the run: accesses and sums. Counting accesses changes no distance, so it can wait
+// until all parts of an update have looked up.
+void count_lookups(Run& run, const Batch& batch) {
+    for (size_t i = 0; i < batch.neighbours.size(); ++i) {
+        run.memory.count_accesses(batch.neighbours[i]);  // every neighbour counts, whether or not it is followed
+        run.tally.unmatched_pairs += batch.neighbours[i].empty();
+    }
+    run.tally.pairs += static_cast<double>(batch.neighbours.size());
+    run.tally.short_pairs += batch.short_pairs;
 }
 
 // WODTEM sec. IV-B.1: the table takes in a trajectory by eq. (4), once, as soon as the trajectory is complete.
@@ -390,17 +437,20 @@ void prepare_tape(Run& run, uint32_t part) {
 }
 
 // One update on one batch. WODTEM sec. IV-B.3, step 3: "alternately optimizing" eq. (8): a step of theta, then one of
-// lambda, with the entropy of the same pass. Errors: nn.not_finite.
+// lambda, with the entropy of the same pass. Errors: nn.not_finite; nn.stopped, where nothing but gradients, which are no
+// state, has changed.
 void update(Run& run) {
     Agent& agent = run.agent;
     Tape<float>& tape = run.learning;
     const uint32_t windows = static_cast<uint32_t>(agent.settings.batch_size), parts = parts_of_batch(agent.settings);
     double loss = 0, entropy = 0;  // L and H-bar of the whole batch: each part adds its windows' share
+    std::vector<Batch> batches;    // [parts]
     {
         const FrozenWeights frozen(run.compute);  // theta stands still until all parts are done
         for (uint32_t part = 0; part < parts; ++part) {
             prepare_tape(run, part);
-            Batch batch = sample_batch(run, windows * part / parts, windows * (part + 1) / parts);
+            Batch& batch =
+                batches.emplace_back(sample_batch(run, windows * part / parts, windows * (part + 1) / parts));
             consult_memory(run, batch);
             const std::vector<float> noise = entropy_noise(run, batch);
             const Policy<float> policy = forward(tape, agent.model, batch.sequences, Queries::every_state);
@@ -414,6 +464,7 @@ void update(Run& run) {
     // Before anything is changed: a run stops at its last sound state.
     if (!std::isfinite(loss + entropy))
         fail("nn.not_finite", "the loss (%g) or the entropy (%g) is not finite", loss, entropy);
+    for (const Batch& batch : batches) count_lookups(run, batch);
     // Eq. (8), theta: gradient descent (LAMB, or AdamW for DT), after which the gradients are zero again.
     const double gradient_norm =
         update_parameters(run.compute, agent.model.parameters, run.optimizer, optimizer_config(agent.settings));
@@ -507,7 +558,7 @@ void append_target(Episode& episode, double target, double reward_scale) {
 
 // Plays one episode in each environment, numbered from `first` on, through the network as one batch, and computes its
 // returns in hindsight. Sec. III-B: g_1 = target; a_t from the policy: sampled, or the most likely one.
-// acting: a tape that does not record, so that there is neither gradient nor dropout.
+// acting: a tape that does not record, so that there is neither gradient nor dropout. Errors: nn.stopped.
 std::vector<Episode> rollout(const Agent& agent, Tape<float>& acting, std::span<Environment* const> environments,
                              Act act, double target, uint64_t first) {
     const FrozenWeights frozen(acting.compute);  // theta stands still during the rollout
@@ -707,7 +758,7 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
     start_offline(run, std::move(data_set));
 }
 
-// Continues from the folder's checkpoint, or begins anew. Returns whether there was a checkpoint.
+// Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint.
 bool begin_or_continue(Run& run, RunFolder& folder) {
     const Settings& settings = run.agent.settings;
     const bool resumed = folder.has("checkpoint.safetensors");
@@ -717,7 +768,6 @@ bool begin_or_continue(Run& run, RunFolder& folder) {
         begin_run(run, make_data_set(settings));
     if (resumed && run.progress.online == 0)  // the checkpoint does not hold the data set
         start_offline(run, offline_set(make_data_set(settings), settings.keep_lowest));
-    if (!resumed) folder.begin_logs();
     return resumed;
 }
 
@@ -778,6 +828,7 @@ struct TrainOptions {
     double checkpoint_every = 30;  // seconds; when a checkpoint is saved decides nothing but what a kill costs
     std::string label = "";        // begins each line of progress
     double later_updates = 0;      // of the runs that follow this one, for the time left
+    std::function<bool()> asked_to_stop = [] { return stop_requested != 0; };
 };
 
 // Saves the checkpoints of a run when they are due, and shows how far it is. When that happens changes no result.
@@ -792,10 +843,11 @@ struct Watcher {
 
     // Errors: run.stopped after a checkpoint that was saved because the user asked to stop; file.*.
     void save_if_due() {
-        if (!stop_requested && !timer.due()) return;
+        const bool stop = options.asked_to_stop();
+        if (!stop && !timer.due()) return;
         timer.time(
             [&] { save_checkpoint(folder, run.agent.settings, [&](auto& archive) { visit_state(archive, run); }); });
-        if (!stop_requested) return;
+        if (!stop) return;
         console.end_line();
         fail("run.stopped", "stopped after update %llu; everything is saved in %s, and the same command continues",
              static_cast<unsigned long long>(run.progress.updates), folder.path.c_str());
@@ -827,16 +879,21 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
         return;
     }
     Compute compute(options.kernel, options.threads);
+    std::optional<StopAtOnce> drawing_and_reading(std::in_place);  // which may take long
+    if (options.asked_to_stop()) fail("run.stopped", "%s", nothing_to_save.data());
     Run run(compute, settings, *make_environment(settings));
-    const bool had_log = folder.has("progress.csv");
-    if (begin_or_continue(run, folder))
+    const bool had_log = folder.has("progress.csv"), resumed = begin_or_continue(run, folder);
+    drawing_and_reading.reset();
+    if (resumed)
         std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(),
                      static_cast<unsigned long long>(run.progress.updates));
     else if (had_log)
         std::fprintf(stderr, "%s: no checkpoint, starting anew\n", path.c_str());
+    if (!resumed) folder.begin_logs();
 
     // Each event of the run has its row in a log; rows come before the checkpoint that counts them.
     Watcher watcher{run, folder, options};
+    compute.asked_to_stop = options.asked_to_stop;
     Observer observer;
     observer.evaluated = [&](const ProgressRow& row, const Evaluation& evaluation) {
         save_maze_paths(run, folder, evaluation);
@@ -852,6 +909,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
         if (run.progress.online == 0) offline_phase(run, observer);
         if (settings.online_steps > 0) online_phase(run, observer);
     } catch (const Error& error) {
+        if (error.id == "nn.stopped") watcher.save_if_due();  // which ends in run.stopped
         if (error.id != "nn.not_finite") throw;
         fail(error.id.c_str(), "update %llu of %s: %s; the run stops here, its last checkpoint is kept",
              static_cast<unsigned long long>(run.progress.updates + 1), path.c_str(), error.what());

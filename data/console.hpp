@@ -6,10 +6,12 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <csignal>
 #include <cstdio>
 #include <string>
+#include <string_view>
 
 using Clock = std::chrono::steady_clock;
 
@@ -26,18 +28,45 @@ inline std::string clock_text(double seconds) {
     return hours + text;
 }
 
-// Set by SIGINT and SIGTERM: a long command then saves its state and ends. A signal handler can reach nothing but a
-// global variable; this is the only one.
+// Set by SIGINT, SIGTERM and SIGHUP: a long command then saves its state and ends. A signal handler can reach nothing but
+// a global variable; this is the only one.
 inline volatile std::sig_atomic_t stop_requested = 0;
 
-inline void stop_on_signals() {
-    for (const int signal : {SIGINT, SIGTERM}) {
-        std::signal(signal, [](int number) {
-            stop_requested = 1;
-            std::signal(number, SIG_DFL);  // a second signal ends the process at once
-        });
+inline constexpr std::array stop_signals = {SIGINT, SIGTERM, SIGHUP};
+using SignalHandler = void (*)(int);
+
+// Installs a handler for all of them, but for SIGHUP where it is ignored: that is nohup. Returns the handlers before.
+inline std::array<SignalHandler, 3> handle_stop_signals(SignalHandler handler) {
+    std::array<SignalHandler, 3> before;
+    for (size_t i = 0; i < before.size(); ++i) {
+        before[i] = std::signal(stop_signals[i], handler);
+        if (stop_signals[i] == SIGHUP && before[i] == SIG_IGN) std::signal(SIGHUP, SIG_IGN);
     }
+    return before;
 }
+
+// From now on a signal asks to stop; the same one again ends the process at once.
+inline void stop_on_signals() {
+    handle_stop_signals([](int number) {
+        stop_requested = 1;
+        std::signal(number, SIG_DFL);
+    });
+}
+
+inline constexpr std::string_view nothing_to_save =
+    "stopped before there was anything new to save; the same command starts again";
+
+// While one lives, a signal ends the process at once, with this sentence: nothing is lost by it.
+struct StopAtOnce {
+    const std::array<SignalHandler, 3> before = handle_stop_signals([](int) {
+        for (const std::string_view text : {std::string_view("wodtem: "), nothing_to_save, std::string_view("\n")})
+            if (::write(STDERR_FILENO, text.data(), text.size()) < 0) break;
+        ::_exit(1);
+    });
+    ~StopAtOnce() {
+        for (size_t i = 0; i < before.size(); ++i) std::signal(stop_signals[i], before[i]);
+    }
+};
 
 struct Console {
     const bool terminal = isatty(STDERR_FILENO) != 0;

@@ -12,7 +12,6 @@
 #pragma once
 
 #include <filesystem>
-#include <fstream>
 
 #include "../mujoco_env.hpp"
 #include "hdf5.hpp"
@@ -199,16 +198,11 @@ inline Rows read_data_set(const std::string& path) {
     return is_minari(file) ? read_minari(file) : read_rows(file);
 }
 
-// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 signature at 0, 512,
-// 1024, 2048, ...: an HDF5 user block may come before it.
+// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock. Errors: those
+// of has_superblock().
 inline bool is_hdf5(const std::string& path) {
     const std::filesystem::path extension = std::filesystem::path(path).extension();
-    if (extension == ".hdf5" || extension == ".h5") return true;
-    std::ifstream file(path, std::ios::binary);
-    char first[8];
-    for (std::streamoff at = 0; file.seekg(at).read(first, 8); at = at == 0 ? 512 : 2 * at)
-        if (std::string_view(first, 8) == "\211HDF\r\n\032\n") return true;
-    return false;
+    return extension == ".hdf5" || extension == ".h5" || has_superblock(path);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -524,6 +524,21 @@ struct Hdf5File {
 
 inline constexpr uint64_t undefined_address = ~uint64_t{0};
 
+// SPEC II.A. The place of the signature in a file of `size` bytes: 0, 512, 1024, 2048, ..., since a user block may come
+// before it. peek(at) returns the 8 bytes there.
+template <class Peek>
+std::optional<size_t> superblock_place(size_t size, Peek&& peek) {
+    for (size_t at = 0; at + 8 <= size; at = at == 0 ? 512 : 2 * at)
+        if (peek(at) == "\x89HDF\r\n\x1a\n") return at;
+    return {};
+}
+
+// The same of a file on the disk, of which it reads no more. Errors: file.open, file.not_regular, file.read.
+inline bool has_superblock(const std::string& path) {
+    const File file(path, O_RDONLY, "file.open", "open it");
+    return superblock_place(file.size(), [&](size_t at) { return file.peek(at, 8); }).has_value();
+}
+
 // Links in a circle, or one structure used again and again, end when more has been read than `budget`, a few times the
 // size of the file; this also bounds what is allocated. Depths are bounded where they occur.
 struct Hdf5Parser {
@@ -606,19 +621,16 @@ struct Hdf5Parser {
         return c;
     }
 
-    // SPEC II.A. The signature is at 0, 512, 1024, 2048, ...; a user block may come before it.
+    // SPEC II.A.
     //   version 0, 1   signature 8 | version | 4 versions | 8, 8: widths | .. | base 8 | free space 8 | end of file 8 |
     //                  driver 8 | root group: name 8, object header 8
     //   version 2, 3   signature 8 | version | 8, 8 | flags | base 8 | extension 8 | end of file 8 | root 8 | sum
     void superblock() {
-        constexpr std::string_view signature = "\x89HDF\r\n\x1a\n";
         const Bytes all = file.bytes;
-        size_t base = 0;
-        const auto found = [&] { return std::ranges::equal(all.subspan(base, 8), as_bytes(signature)); };
-        while (base + 8 <= all.size() && !found()) base = base == 0 ? 512 : 2 * base;
-        if (base + 8 > all.size())
-            fail("hdf5.format", "%s: is not an HDF5 file (it has no superblock)", file.path.c_str());
-        file.bytes = all.subspan(base);
+        const auto peek = [&](size_t at) { return std::string(all.begin() + at, all.begin() + at + 8); };
+        const std::optional<size_t> place = superblock_place(all.size(), peek);
+        if (!place) fail("hdf5.format", "%s: is not an HDF5 file (it has no superblock)", file.path.c_str());
+        file.bytes = all.subspan(*place);
         Cursor c = cursor(8);
         c.start = 0;
         const uint64_t version = c.number(1);
@@ -1262,8 +1274,9 @@ inline Hdf5File parse_hdf5(Bytes bytes, std::shared_ptr<const void> owner, const
     return file;
 }
 
+// Of a file without a superblock nothing more is read. Errors: those of parse_hdf5() and read_file().
 inline Hdf5File open_hdf5(const std::string& path) {
-    const auto owner = std::make_shared<const std::string>(read_file(path));
+    const auto owner = std::make_shared<const std::string>(has_superblock(path) ? read_file(path) : "");
     return parse_hdf5(as_bytes(*owner), owner, path);
 }
 

@@ -94,10 +94,9 @@ std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
 }
 
 inline void print_tensors(const std::string& path) {
-    const std::string bytes = read_file(path);
-    const uint32_t checksum = crc32(bytes);
-    const TensorFile file = parse_safetensors(bytes, path);
-    std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), bytes.size(), hex8(checksum).c_str());
+    const TensorFile file = read_safetensors(path);
+    std::printf("%s: safetensors, %zu bytes, crc32 %s\n", path.c_str(), file.buffer.size(),
+                hex8(crc32(file.buffer)).c_str());
     for (const auto& [key, text] : file.metadata) {
         std::string shown = key + (text.find('\n') == std::string::npos ? ": " : ":\n") + text;
         for (char& c : shown)

@@ -84,7 +84,8 @@ inline void check_model(const ModelContents& model, const std::string& path) {
     };
     for (const Parameter<float>& parameter : model.parameters)
         for (const float value : parameter.value) require(std::isfinite(value), parameter.name, "finite");
-    require(std::isfinite(std::exp(model.log_temperature.value[0])), "log_temperature",
+    const float log_temperature = model.log_temperature.value[0];
+    require(std::isfinite(log_temperature) && std::isfinite(std::exp(log_temperature)), "log_temperature",
             "finite, nor is its exponential");
     for (const float value : model.state_mean) require(std::isfinite(value), "state_mean", "finite");
     for (const float value : model.state_std)

@@ -255,11 +255,12 @@ inline void save_checkpoint(RunFolder& folder, const Settings& settings, auto&& 
     write_safetensors(folder.file("checkpoint.safetensors"), file);
 }
 
-// Reads the state alone. Errors name the file: checkpoint.format, run.other_settings, and those of the visited state.
+// Reads the state alone. Errors name the file: checkpoint.format, run.other_settings, safetensors.*, and those of the
+// visited state.
 inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit) {
     const std::string path = folder.file("checkpoint.safetensors");
     try {
-        const TensorFile file = read_safetensors(path);
+        const TensorFile file = read_own_safetensors(path);
         if (file.text("format") != checkpoint_format)
             fail("checkpoint.format", "it is no checkpoint of `wodtem train`");
         require_same_settings(settings_from_text(file.text("settings"), path), settings, path);

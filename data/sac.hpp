@@ -517,7 +517,7 @@ inline void save_checkpoint(const std::string& path, Learner& learner, const std
 // Call resume() afterwards. Errors: sac.checkpoint, checkpoint.shape, file.*, safetensors.*; the learner may then hold
 // half of the checkpoint and must be dropped.
 inline void load_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
-    const TensorFile file = read_safetensors(path);
+    const TensorFile file = read_own_safetensors(path);
     if (file.text("format") != "wodtem sac checkpoint 2")
         fail("sac.checkpoint", "%s: is not a SAC checkpoint of this version; remove it to train anew", path.c_str());
     const std::string wanted = settings_text(learner) + " " + note;

@@ -57,6 +57,31 @@ struct File : FileDescriptor {
             fail("file.not_regular", "%s: is not a regular file; give a file's path", path.c_str());
         return static_cast<size_t>(status.st_size);
     }
+    // The `count` bytes at an offset, or fewer at the file's end. Errors: file.read.
+    std::string peek(size_t at, size_t count) const {
+        std::string bytes(count, '\0');
+        ssize_t got = 0;
+        do got = ::pread(fd, bytes.data(), count, static_cast<off_t>(at));
+        while (got < 0 && errno == EINTR);
+        if (got < 0) fail_file("file.read", "read it", path);
+        bytes.resize(static_cast<size_t>(got));
+        return bytes;
+    }
+    // Makes `bytes` hold the file's first `count` bytes, of which it may hold the first ones already.
+    // Errors: file.too_large, before anything is allocated; file.read.
+    void read(std::string& bytes, size_t count, size_t limit = size_t{1} << 36) const {
+        if (count > limit)
+            fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), count, limit);
+        size_t done = bytes.size();
+        bytes.resize(count);
+        while (done < count) {
+            const ssize_t got = ::read(fd, bytes.data() + done, count - done);
+            if (got < 0 && errno == EINTR) continue;
+            if (got < 0) fail_file("file.read", "read it", path);
+            if (got == 0) fail("file.read", "%s: shrank while it was read (%zu bytes); try again", path.c_str(), count);
+            done += static_cast<size_t>(got);
+        }
+    }
     // This is the only call of write(), which may be interrupted and may take fewer bytes than it was given (POSIX).
     void write(std::string_view bytes) const {
         while (!bytes.empty()) {
@@ -75,16 +100,8 @@ struct File : FileDescriptor {
 // file.too_large, file.read.
 inline std::string read_file(const std::string& path, size_t limit = size_t{1} << 36) {
     const File file(path, O_RDONLY, "file.open", "open it");
-    const size_t size = file.size();
-    if (size > limit) fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), size, limit);
-    std::string bytes(size, '\0');
-    for (size_t done = 0; done < size;) {
-        const ssize_t count = ::read(file.fd, bytes.data() + done, size - done);
-        if (count < 0 && errno == EINTR) continue;
-        if (count < 0) fail_file("file.read", "read it", path);
-        if (count == 0) fail("file.read", "%s: shrank while it was read (%zu bytes); try again", path.c_str(), size);
-        done += static_cast<size_t>(count);
-    }
+    std::string bytes;
+    file.read(bytes, file.size(), limit);
     return bytes;
 }
 
@@ -282,6 +299,7 @@ struct TensorFile {
     std::map<std::string, size_t> index;  // name -> place in `tensors`
     std::string buffer;
     size_t data_start = 0;
+    bool has_checksums = false;  // the file had both checksum entries, and they held
 
     std::string_view data() const { return std::string_view(buffer).substr(data_start); }
     std::string_view bytes(const StoredTensor& tensor) const { return data().substr(tensor.begin, tensor.size); }
@@ -358,7 +376,8 @@ struct TensorFile {
 //
 // Two metadata entries are this program's own. crc32.tensors: 8 hex digits for each tensor, in the order of the data.
 // crc32.header: the CRC-32 of bytes 0 to 8 + N, its own eight digits (bytes 41 to 48) taken as 00000000. A file with
-// neither was made elsewhere and is read unchecked; otherwise both must hold, so no single changed bit goes unnoticed.
+// neither was made elsewhere and is read unchecked, but for checkpoints, which are refused; otherwise both must hold, so
+// no single changed bit goes unnoticed.
 
 inline constexpr size_t header_limit = 100'000'000;  // bytes; the same as in the original implementation
 inline constexpr std::string_view header_start = "{\"__metadata__\":{\"crc32.header\":\"";
@@ -521,10 +540,10 @@ inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
 }
 
 // Refuses holes, overlaps and a rest. Sorts the tensors by place: a header of another program may have any order.
-inline void check_layout(TensorFile& file) {
+// available: bytes of data.
+inline void check_layout(TensorFile& file, size_t available) {
     // By size too: an empty tensor comes before the one that follows it.
     std::ranges::stable_sort(file.tensors, {}, [](const StoredTensor& t) { return std::pair(t.begin, t.size); });
-    const size_t available = file.data().size();
     size_t next = 0;
     for (const StoredTensor& tensor : file.tensors) {
         const std::string place = tensor_place(file.path, tensor.name);
@@ -553,6 +572,7 @@ inline void check_checksums(TensorFile& file) {
              "%s: the header does not match its checksum; the file is damaged (a program that rewrites it must "
              "drop the metadata entries crc32.header and crc32.tensors)",
              file.path.c_str());
+    file.has_checksums = true;
     for (size_t i = 0; i < file.tensors.size(); ++i) {
         const std::string found = hex8(crc32(file.bytes(file.tensors[i])));
         const std::string expected = tensors.mapped().substr(8 * i, 8);
@@ -562,16 +582,17 @@ inline void check_checksums(TensorFile& file) {
     }
 }
 
-// Reads a file's bytes; `path` is for messages. Errors: safetensors.truncated, .header_length, .json, .name,
-// .duplicate_name, .dtype, .shape, .offsets, .trailing, .checksum.
-inline TensorFile parse_safetensors(std::string bytes, const std::string& path) {
+// Reads a file of `size` bytes, its header before its data, so that a file of another kind is refused by its first
+// bytes. read(buffer, n) makes `buffer` hold the first n bytes; `path` is for messages. Errors: those of read();
+// safetensors.truncated, .header_length, .json, .name, .duplicate_name, .dtype, .shape, .offsets, .trailing, .checksum.
+template <class Read>
+TensorFile parse_safetensors(size_t size, const std::string& path, Read&& read) {
     TensorFile file;
     file.path = path;
-    file.buffer = std::move(bytes);
     size_t length = 0;
-    const size_t size = file.buffer.size();
     if (size < 8)
         fail("safetensors.truncated", "%s: offset 0: %zu bytes are too few for a header length", path.c_str(), size);
+    read(file.buffer, 8);
     std::memcpy(&length, file.buffer.data(), 8);
     if (length > header_limit)
         fail("safetensors.header_length", "%s: offset 0: header length %zu is above %zu; not a safetensors file?",
@@ -581,6 +602,7 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
              "%s: offset 8: the header should have %zu bytes, %zu follow; the file was cut off", path.c_str(), length,
              size - 8);
     file.data_start = 8 + length;
+    read(file.buffer, file.data_start);
 
     HeaderReader reader{std::string_view(file.buffer).substr(0, file.data_start), path};
     if (!is_utf8(reader.file.substr(8))) reader.expected("a header in UTF-8");
@@ -594,14 +616,34 @@ inline TensorFile parse_safetensors(std::string bytes, const std::string& path) 
     reader.skip_space();
     if (reader.at != file.data_start) reader.expected("spaces up to the end of the header");
 
-    check_layout(file);
+    check_layout(file, size - file.data_start);
+    read(file.buffer, size);
     check_checksums(file);
     file.index.erase("__metadata__");
     for (size_t i = 0; i < file.tensors.size(); ++i) file.index[file.tensors[i].name] = i;  // known after the sort
     return file;
 }
 
-inline TensorFile read_safetensors(const std::string& path) { return parse_safetensors(read_file(path), path); }
+inline TensorFile parse_safetensors(const std::string& bytes, const std::string& path) {
+    return parse_safetensors(bytes.size(), path, [&](std::string& buffer, size_t n) {
+        buffer.append(bytes, buffer.size(), n - buffer.size());
+    });
+}
+
+// Errors: those of parse_safetensors(); file.open, file.not_regular, file.too_large, file.read.
+inline TensorFile read_safetensors(const std::string& path) {
+    const File file(path, O_RDONLY, "file.open", "open it");
+    return parse_safetensors(file.size(), path, [&](std::string& buffer, size_t n) { file.read(buffer, n); });
+}
+
+// A file that this program alone writes: its checksums must be there. Errors: safetensors.unchecked beside the above.
+inline TensorFile read_own_safetensors(const std::string& path) {
+    TensorFile file = read_safetensors(path);
+    if (!file.has_checksums)
+        fail("safetensors.unchecked", "%s: lacks the metadata entries crc32.header and crc32.tensors, its checksums",
+             path.c_str());
+    return file;
+}
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Archives, for state that lists its fields once: visit(archive) calls archive(name, field) for each of them, or

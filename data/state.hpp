@@ -7,9 +7,27 @@
 
 #include "../memory.hpp"  // and with it nn.hpp and the standard headers
 
+// Errors: checkpoint.entry names the entry and the condition that no run can have broken.
+inline void require_entry(bool holds, const std::string& entry, const char* condition) {
+    if (!holds) fail("checkpoint.entry", "the entry %s %s", entry.c_str(), condition);
+}
+
+inline void require_finite(const std::string& entry, const auto& values) {
+    for (const auto value : values)
+        require_entry(std::isfinite(static_cast<double>(value)), entry, "holds a number that is not finite");
+}
+
+// moves: how many discrete actions there are to choose from; 0: actions are continuous.
+inline void require_actions(const std::string& entry, const std::vector<float>& actions, int moves) {
+    require_finite(entry, actions);
+    for (const float action : actions)
+        require_entry(moves == 0 || (action >= 0 && action < static_cast<float>(moves) && action == std::floor(action)),
+                      entry, "holds an action that is no move");
+}
+
 // Visits trained parameters and the state of their optimiser: "NAME.updates", then for each parameter "NAME.value.P",
 // "NAME.first_moment.P" and "NAME.second_moment.P". Values are loaded in place, because tensors point at them; moments
-// that no update has touched yet are saved as zeros.
+// that no update has touched yet are saved as zeros. Errors: checkpoint.entry.
 template <class Archive>
 void visit_trained(Archive& archive, const std::string& name, std::vector<Parameter<float>>& parameters,
                    Optimizer& optimizer) {
@@ -23,6 +41,11 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
         archive(name + ".value." + parameter, parameters[i].value);
         archive(name + ".first_moment." + parameter, optimizer.first_moment[i]);
         archive(name + ".second_moment." + parameter, optimizer.second_moment[i]);
+        if (!archive.loading) continue;
+        require_finite(name + ".value." + parameter, parameters[i].value);
+        require_finite(name + ".first_moment." + parameter, optimizer.first_moment[i]);
+        for (const float value : optimizer.second_moment[i])  // a sum of squares, which may have become infinite
+            require_entry(value >= 0, name + ".second_moment." + parameter, "holds a number that is not 0 or more");
     }
 }
 
@@ -30,9 +53,9 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
 // The replay buffer: trajectories laid end to end; returns are computed again.
 
 // Visits states [steps, state_dim], actions [steps, action_dim] and rewards [steps] of all trajectories, and each one's
-// length and end. Errors: checkpoint.replay if the sizes do not fit together; those of relabel().
+// length and end. moves: see require_actions(). Errors: checkpoint.entry.
 template <class Archive>
-void visit_replay(Archive& archive, ReplayBuffer& replay) {
+void visit_replay(Archive& archive, ReplayBuffer& replay, int moves) {
     std::vector<float> states, actions, rewards;
     std::vector<uint32_t> lengths, terminated;
     const auto append = [](auto& all, const auto& part) { all.insert(all.end(), part.begin(), part.end()); };
@@ -53,15 +76,23 @@ void visit_replay(Archive& archive, ReplayBuffer& replay) {
     if (!archive.loading) return;
 
     const size_t S = replay.state_dim, A = replay.action_dim, count = lengths.size();
+    require_entry(count >= 1 && count <= replay.capacity, "replay.lengths", "has none or more than the buffer holds");
+    for (const uint32_t length : lengths)  // a number of a trajectory is indexed by an int
+        require_entry(length >= 1 && length <= INT32_MAX / std::max(S, A), "replay.lengths",
+                      "holds a length of no trajectory");
     const size_t steps = std::accumulate(lengths.begin(), lengths.end(), size_t{0});
-    if (count != terminated.size() || count > replay.capacity || steps != rewards.size() ||
-        states.size() != steps * S || actions.size() != steps * A ||
-        replay.next >= std::max<size_t>(replay.capacity, 1) || (count < replay.capacity && replay.next != 0))
-        fail("checkpoint.replay",
-             "the replay buffer does not fit together: %zu trajectories of %zu steps in all (at most %zu "
-             "trajectories), %zu flags, %zu states of %zu, %zu actions of %zu, %zu rewards, next %zu",
-             count, steps, replay.capacity, terminated.size(), states.size(), S, actions.size(), A, rewards.size(),
-             static_cast<size_t>(replay.next));
+    require_entry(terminated.size() == count, "replay.terminated", "has not one flag for each of replay.lengths");
+    for (const uint32_t flag : terminated)
+        require_entry(flag <= 1, "replay.terminated", "holds a flag that is neither 0 nor 1");
+    const char* const wrong_size = "has not as many numbers as replay.lengths call for";
+    require_entry(states.size() == steps * S, "replay.states", wrong_size);
+    require_entry(actions.size() == steps * A, "replay.actions", wrong_size);
+    require_entry(rewards.size() == steps, "replay.rewards", wrong_size);
+    require_finite("replay.states", states);
+    require_actions("replay.actions", actions, moves);
+    require_finite("replay.rewards", rewards);
+    require_entry(count < replay.capacity ? replay.next == 0 : replay.next < replay.capacity, "replay.next",
+                  "is not the number of a trajectory to be overwritten");
     replay.trajectories.assign(count, {});
     for (size_t i = 0, t = 0; i < count; t += lengths[i], ++i) {
         Trajectory& trajectory = replay.trajectories[i];
@@ -80,38 +111,40 @@ void visit_replay(Archive& archive, ReplayBuffer& replay) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The episodic memory: its columns; everything else is derived from them.
 
-// Errors: checkpoint.memory names the column and the condition that no run can have broken.
+// moves: see require_actions(). Errors: checkpoint.entry.
 template <class Archive>
-void visit_memory(Archive& archive, EpisodicMemory& memory) {
+void visit_memory(Archive& archive, EpisodicMemory& memory, int moves) {
     EpisodicMemory::for_each_column(memory, [&](const char* name, auto& column, size_t) { archive(name, column); });
     archive("memory.projection", memory.projection);
     archive("memory.accesses", memory.accesses);
     archive("memory.insertions", memory.insertions);
     if (!archive.loading) return;
 
-    const auto require = [](bool holds, const char* name, const char* condition) {
-        if (!holds) fail("checkpoint.memory", "the episodic memory does not fit together: %s %s", name, condition);
-    };
     const auto has_repetition = [](auto values) {
         std::sort(values.begin(), values.end());
         return std::adjacent_find(values.begin(), values.end()) != values.end();
     };
     const size_t n = memory.size(), cells = static_cast<size_t>(memory.config.projected_dim) * memory.S;
-    require(n <= memory.config.capacity, "memory.e", "has more entries than the table may hold");
+    require_entry(n <= memory.config.capacity, "memory.e", "has more entries than the table may hold");
     EpisodicMemory::for_each_column(memory, [&](const char* name, const auto& column, size_t width) {
-        require(column.size() == n * width, name, "has a wrong number of values");
-        for (const auto value : column)
-            require(std::isfinite(static_cast<double>(value)), name, "holds a number that is not finite");
+        require_entry(column.size() == n * width, name, "has a wrong number of values");
+        require_finite(name, column);
     });
-    require(memory.projection.size() == cells, "memory.projection", "has a wrong number of values");
-    for (const double value : memory.projection) require(std::isfinite(value), "memory.projection", "is not finite");
-    require(!has_repetition(memory.age), "memory.age", "repeats itself");
+    require_actions("memory.actions", memory.actions, moves);
+    require_entry(memory.projection.size() == cells, "memory.projection", "has a wrong number of values");
+    require_finite("memory.projection", memory.projection);
+    // Each insertion is an access; before the table is full nothing is removed; 2^62 is out of any run's reach.
+    require_entry(memory.accesses < uint64_t{1} << 62, "memory.accesses", "is more than a run can count");
+    require_entry(memory.insertions <= memory.accesses, "memory.insertions", "exceeds memory.accesses");
+    require_entry(n == memory.config.capacity || memory.insertions == n, "memory.insertions",
+                  "is not the number of entries, though the table was never full");
+    require_entry(!has_repetition(memory.age), "memory.age", "repeats itself");
     for (const uint64_t value : memory.age)
-        require(value < memory.insertions, "memory.age", "exceeds memory.insertions");
+        require_entry(value < memory.insertions, "memory.age", "exceeds memory.insertions");
     for (const uint64_t value : memory.priority)
-        require(value >= 1 && value <= memory.accesses, "memory.priority", "lies outside 1 .. memory.accesses");
+        require_entry(value >= 1 && value <= memory.accesses, "memory.priority", "lies outside 1 .. memory.accesses");
     std::vector<Words4> keys;
     for (size_t i = 0; i < n; ++i) keys.push_back(memory.key_of(i));
-    require(!has_repetition(keys), "memory.keys", "holds a key twice");
+    require_entry(!has_repetition(keys), "memory.keys", "holds a key twice");
     memory.rebuild_derived();
 }

@@ -807,13 +807,13 @@ TEST(a_loaded_memory_continues_like_the_one_that_was_saved) {
         };
         for (uint64_t i = 0; i < 3000; ++i) advance(saved, i);
         ToyArchive archive;
-        visit_memory(archive, saved);
+        visit_memory(archive, saved, 0);
         archive.loading = true;
-        visit_memory(archive, loaded);
+        visit_memory(archive, loaded, 0);
         for (uint64_t i = 3000; i < 6000; ++i) CHECK(same(advance(saved, i), advance(loaded, i)));
         ToyArchive first, second;
-        visit_memory(first, saved);
-        visit_memory(second, loaded);
+        visit_memory(first, saved, 0);
+        visit_memory(second, loaded, 0);
         CHECK(first.fields == second.fields && first.fields.size() == 9);
     }
 }
@@ -821,22 +821,26 @@ TEST(a_loaded_memory_continues_like_the_one_that_was_saved) {
 TEST(a_damaged_memory_is_refused) {
     EpisodicMemory memory = table_of(small(), {{1, 1, 1}, {2, 2, 2}, {3, 3, 3}});
     ToyArchive good;
-    visit_memory(good, memory);
+    visit_memory(good, memory, 0);
     good.loading = true;
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.e"].resize(16);
-                visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.e"][7] = 0x7F;
-                bad.fields["memory.e"][6] = 0xF0; visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.keys"] = std::vector<unsigned char>(48);
-                visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 2; visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.age"][0] = 9; visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.priority"][0] = 0;
-                visit_memory(bad, memory));
-    CHECK_FAILS("checkpoint.memory", ToyArchive bad = good; bad.fields["memory.projection"].resize(8);
-                visit_memory(bad, memory));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.e"].resize(16);
+                visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.e"][7] = 0x7F;
+                bad.fields["memory.e"][6] = 0xF0; visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.keys"] = std::vector<unsigned char>(48);
+                visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.age"][0] = 2;
+                visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.age"][0] = 9;
+                visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.priority"][0] = 0;
+                visit_memory(bad, memory, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.projection"].resize(8);
+                visit_memory(bad, memory, 0));
+    visit_memory(good, memory, 4);
+    for (const int moves : {1, 3}) CHECK_FAILS("checkpoint.entry", visit_memory(good, memory, moves));
     memory.config.capacity = 2;
-    CHECK_FAILS("checkpoint.memory", visit_memory(good, memory));
+    CHECK_FAILS("checkpoint.entry", visit_memory(good, memory, 0));
 }
 
 TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
@@ -845,9 +849,9 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
     saved.trajectories[1].terminated = true;
     saved.add(with_return(2, 7));
     ToyArchive archive;
-    visit_replay(archive, saved);
+    visit_replay(archive, saved, 0);
     archive.loading = true;
-    visit_replay(archive, loaded);
+    visit_replay(archive, loaded, 0);
     for (ReplayBuffer* replay : {&saved, &loaded}) replay->add(with_return(9, 4));
     const Random random{test_seed(), Stream::batch};
     for (uint32_t i = 0; i < 100; ++i) {
@@ -859,10 +863,10 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
         CHECK(saved.trajectories[i].discounted_returns == loaded.trajectories[i].discounted_returns);
         CHECK(saved.trajectories[i].terminated == loaded.trajectories[i].terminated);
     }
-    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.lengths"][0] = 1;
-                visit_replay(bad, loaded));
-    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.next"][0] = 3;
-                visit_replay(bad, loaded));
-    CHECK_FAILS("checkpoint.replay", ToyArchive bad = archive; bad.fields["replay.states"].pop_back();
-                bad.fields["replay.states"].resize(4); visit_replay(bad, loaded));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = archive; bad.fields["replay.lengths"][0] = 1;
+                visit_replay(bad, loaded, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = archive; bad.fields["replay.next"][0] = 3;
+                visit_replay(bad, loaded, 0));
+    CHECK_FAILS("checkpoint.entry", ToyArchive bad = archive; bad.fields["replay.states"].pop_back();
+                bad.fields["replay.states"].resize(4); visit_replay(bad, loaded, 0));
 }
