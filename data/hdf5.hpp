@@ -1305,7 +1305,7 @@ class Hdf5Writer {
         const std::string start = "\x89HDF\r\n\x1a\n" + std::string(5, '\0') + "\x08\x08" + '\0' + little(leaf_k_, 2) +
                                   little(tree_k, 2) + little(0, 4 + 8) + none + little(position_, 8) + none +
                                   little(0, 8) + root;  // SPEC II.A, version 0
-        if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.temporary);
+        if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.path);
         file_.write(start);
         file_.commit();
     }
