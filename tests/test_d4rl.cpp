@@ -1,4 +1,5 @@
-// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; and the search for a file.
+// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; the search for a file, and its
+// name among the settings.
 #include <unistd.h>
 
 #include "../data/d4rl.hpp"
@@ -200,4 +201,31 @@ TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
     std::filesystem::remove_all(folder);
     CHECK(find_published("maze2d-huge-v1") == nullptr);
     for (const PublishedDataSet& one : published_data_sets) CHECK(find_mujoco_task(one.id) != nullptr);
+}
+
+TEST(any_name_of_a_data_set_is_read_back_and_its_checksum_alone_tells_data_apart) {
+    Settings settings;
+    constexpr const char* names =  // between bars
+        "plain.hdf5|my set # 2.hdf5| a|a |a\t|a\nseed = 1 # x||#|\"|\"a\"|a\"b # c|\\|\\x41|\"\\x41\"|\x7f\x1b[31m|"
+        "M\u00e4\u4e2d # .h5|\xff\xfe|a = b|a#b|none # ";
+    for (const std::string& name : split(names, '|')) {
+        settings.dataset = name;
+        const std::string text = settings_text(settings);
+        CHECK_EQUAL(settings_from_text(text, "f").dataset, name);
+        CHECK(is_utf8(text) && std::ranges::count(text, '\n') == std::ranges::count(settings_text({}), '\n'));
+        CHECK_EQUAL(settings_text(settings_from_text(text, "f")), text);
+    }
+    CHECK_EQUAL(quoted("my set.hdf5"), "my set.hdf5");  // as before
+    CHECK_EQUAL(quoted("a\\b"), "a\\b");
+    CHECK_EQUAL(quoted(" M\u00e4 # 2\n"), "\" M\u00e4 \\x23 2\\x0a\"");
+    for (const char* earlier : {"\"", "\"a", "\"a\" b", "\"a\"b\"", "\"\\\"", "\"\\x4\"", "\"\\x4g\"", "\"\\y41\""})
+        CHECK_EQUAL(unquoted(earlier), earlier);  // what earlier versions wrote for such names
+
+    Settings renamed = settings;
+    renamed.dataset = "another name";
+    require_same_settings(settings, renamed, "f");
+    renamed.dataset_sha256 = "0123";
+    CHECK_FAILS("run.other_settings", require_same_settings(settings, renamed, "f"));
+    renamed.dataset = settings.dataset;
+    CHECK_FAILS("run.other_settings", require_same_settings(settings, renamed, "f"));
 }

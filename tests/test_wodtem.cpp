@@ -1105,6 +1105,12 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     const Table progress = parse_csv(read_file(scratch / "whole/progress.csv"), "progress.csv");
     CHECK_EQUAL(progress.rows[0][0], "offline");
     CHECK(std::stod(progress.rows[0][5]) > 0);  // something was learned from
+    stop_requested = 1;
+    CHECK_FAILS("run.stopped", quiet_train(settings, scratch / "renamed", 2));
+    stop_requested = 0;
+    settings.dataset = " my set # 2\n.hdf5";  // another name for the same data: the same run
+    quiet_train(settings, scratch / "renamed", 2);
+    check_shell("./wodtem eval " + scratch / "renamed", 0, "over 1 episode");
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
 
