@@ -756,8 +756,8 @@ struct Hdf5Parser {
         return plain;
     }
 
-    // SPEC IV.A.2.m: version | flags | sizes of name, type and space 2, 2, 2 | [character set] | the three, in version 1
-    // each filled up to a multiple of 8 | value
+    // SPEC IV.A.2.m: version | flags | sizes of name, type and space 2, 2, 2 | [character set] | the three (in version
+    // 1 each filled up to a multiple of 8) | value
     void attribute(Cursor c) {
         const auto [version, flags, name_size, type_size, space_size] = c.fields(1, 1, 2, 2, 2);
         c.expect(version >= 1 && version <= 3, "an attribute of version 1 to 3");
@@ -808,7 +808,7 @@ struct Hdf5Parser {
     // SPEC IV.A.2.r: the message of an old group.
     //   message      B-tree 8 | local heap 8
     //   local heap   HEAP 0 | .. 3 | size 8 | free list 8 | names 8, each ended by a NUL                 (III.D)
-    //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 4, path of a soft link in
+    //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 4, a soft link's path in
     //                the heap 4, .. 12                                                                   (III.B, III.C)
     void symbol_table(Links& links, Cursor message) {
         const auto [tree, heap_address] = message.fields(8, 8);
@@ -831,7 +831,7 @@ struct Hdf5Parser {
         });
     }
 
-    // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name, then by the type
+    // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name, then by type
     //   0, hard: address 8 | 1, soft: length 2, path | 64, external: length 2, flags 1, file NUL, path NUL
     void link_message(Links& links, Cursor c) {
         const auto [version, flags] = c.fields(1, 1);

@@ -1,5 +1,5 @@
-// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; the search for a file, and its
-// name among the settings.
+// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; the search for a file, and
+// its name among the settings.
 #include <unistd.h>
 
 #include "../data/d4rl.hpp"
