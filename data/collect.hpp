@@ -358,10 +358,11 @@ void train_in_folder(const std::string& path, Train&& train) {
     const std::string folder = path + ".training", checkpoint = folder + "/checkpoint.safetensors";
     make_folder(folder, "collect.folder");
     const FolderLock lock(folder);
+    remove_temporaries(folder);
     stop_on_signals();
     train(checkpoint);
     std::error_code ignored;
-    for (const std::string& file : {checkpoint, checkpoint + ".tmp"}) std::filesystem::remove(file, ignored);
+    std::filesystem::remove(checkpoint, ignored);
     std::filesystem::remove(folder, ignored);
 }
 
@@ -428,7 +429,7 @@ inline std::string collect_help() {
 }
 
 // The command `collect`. out: "" for D4RL's file name in runs/datasets; steps: 0 for as many rows as D4RL's.
-// Errors: usage.task names the nearest data set; those of collect_data_set_file().
+// Errors: usage.task names the nearest data set; those of require_other_file() and collect_data_set_file().
 inline void collect(const std::string& id, const std::string& out, int64_t steps, int64_t seed,
                     const std::string& policy, int threads) {
     const PublishedDataSet* set = find_published(id);
@@ -442,6 +443,7 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
     if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);
     const std::string name = walker ? id + ".safetensors" : file_name(*set);
     const std::string path = out.empty() ? std::string(own_folder) + "/" + name : out;
+    require_other_file(path, policy);  // now, not after hours of training
     Console console{.label = id};
     const Watch watch{[&](const std::string& phase, double share, const std::string& text) {
                           console.show(phase, share, 0, [&] { return text; });

@@ -386,13 +386,15 @@ inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
     for (const std::string& method : methods) {
         for (const int64_t seed : seeds) {
             Settings settings = settings_of(arguments, arguments.words[0], method, seed);
+            const std::string folder = folder_of(arguments, settings);
             if (arguments.has("--weights")) {
                 settings.weights_path = model_path(arguments["--weights"]);
+                require_other_file(folder + "/model.safetensors", settings.weights_path);
                 set_from(settings, "first_weights", sha256_of_file(settings.weights_path), "SHA-256 of the model file");
             }
             const std::string place = std::to_string(runs.size() + 1) + " of " + std::to_string(count) + ": ";
             const std::string label = method_label(method) + ", seed " + std::to_string(seed);
-            runs.push_back({settings, folder_of(arguments, settings), (count > 1 ? place : "") + label});
+            runs.push_back({settings, folder, (count > 1 ? place : "") + label});
         }
     }
     return runs;

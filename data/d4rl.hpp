@@ -5,8 +5,10 @@
 //   rewards             N        r_t                                terminals   N        the task ended the episode
 //   timeouts            N        the time limit ended the episode; missing in the first versions
 //   next_observations   N x S    s_{t+1}; in the gym tasks alone    infos, metadata      not used
+// d3rlpy 1 writes the same but for episode_terminals, N, in the place of timeouts: the last step of any episode.
 // A Minari file has a group for each episode, of T steps:
 //   episode_0/observations  T+1 x S | actions  T x A | rewards, terminations, truncations  T          episode_1/...
+// and in the attribute total_episodes says how many there are.
 // Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
@@ -123,6 +125,9 @@ struct Hdf5Table {
 inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::optional<uint64_t> rows = {},
                           std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
+    const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
+    if (!found && std::ranges::any_of(file.datasets, below))
+        throw Error("dataset.shape", file.path + ": \"" + name + "\" is a group; write one table of numbers instead");
     if (!found)
         throw Error("dataset.shape", file.path + ": has no data set \"" + name + "\"; it is not in D4RL's layout");
     const Shape& shape = found->shape;
@@ -134,7 +139,21 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
     return {*found, shape[0], width};
 }
 
-// Reads D4RL's layout. Errors: dataset.shape, those of hdf5.hpp.
+// Refuses a column that is neither D4RL's nor d3rlpy's: it may mark the ends of episodes. Errors: dataset.column.
+inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std::string& ends) {
+    for (const std::string& name : file.names()) {
+        const std::set<std::string> known = {"observations", "actions", "rewards", "terminals", "next_observations"};
+        if (name.find('/') != std::string::npos || known.contains(name) || name == ends) continue;
+        const Hdf5Dataset* column = file.find(name);
+        if (column && !column->shape.empty() && column->shape[0] == rows)
+            fail("dataset.column",
+                 "%s: \"%s\" has a row for each step and is not read beside %s; name what marks the ends of episodes "
+                 "timeouts, and move the rest to a group such as infos",
+                 file.path.c_str(), name.c_str(), ends.c_str());
+    }
+}
+
+// Reads D4RL's layout. Errors: dataset.shape, dataset.column, those of hdf5.hpp.
 inline Rows read_rows(const Hdf5File& file) {
     const Hdf5Table states = table_of(file, "observations"), actions = table_of(file, "actions", states.rows);
     Rows rows;
@@ -150,32 +169,64 @@ inline Rows read_rows(const Hdf5File& file) {
     rows.actions = file.read_floats(actions.data);
     rows.rewards = file.read_floats(column("rewards"));
     rows.terminals = file.read_flags(column("terminals"));
-    if (file.find("timeouts")) rows.timeouts = file.read_flags(column("timeouts"));
+    const std::string ends =
+        file.find("episode_terminals") && !file.find("timeouts") ? "episode_terminals" : "timeouts";
+    require_known_columns(file, rows.count, ends);
+    if (file.find(ends)) rows.timeouts = file.read_flags(column(ends.c_str()));
+    if (ends == "episode_terminals")  // also set where the task ended the episode, which is no timeout
+        for (size_t row = 0; row < rows.count; ++row) rows.timeouts[row] &= rows.terminals[row] == 0;
     if (file.find("next_observations"))
         rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim).data);
     return rows;
 }
 
-inline bool is_minari(const Hdf5File& file) { return file.find("episode_0/observations") != nullptr; }
+// The number of the episode in whose group, "episode_12", a name of Minari's layout lies; nothing for other names.
+inline std::optional<uint64_t> minari_episode(const std::string& name) {
+    const std::string group = name.substr(0, name.find('/'));
+    uint64_t number = 0;
+    if (group.starts_with("episode_")) std::from_chars(group.data() + 8, group.data() + group.size(), number);
+    return group == "episode_" + std::to_string(number) ? std::optional(number) : std::nullopt;
+}
+
+inline bool is_minari(const Hdf5File& file) {
+    return std::ranges::any_of(file.names(), [](const std::string& name) { return minari_episode(name).has_value(); });
+}
+
+// The numbers of Minari's episodes, ascending; some may be missing between them. Errors: dataset.episodes if the file
+// counts them otherwise, dataset.column for what belongs to no episode.
+inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
+    std::set<uint64_t> episodes;
+    for (const std::string& name : file.names()) {
+        const std::optional<uint64_t> episode = minari_episode(name);
+        if (!episode)
+            fail("dataset.column", "%s: \"%s\" lies in none of Minari's groups episode_0, episode_1, ...",
+                 file.path.c_str(), name.c_str());
+        episodes.insert(*episode);
+    }
+    const auto stated = file.attributes.find("total_episodes");
+    if (stated != file.attributes.end() && stated->second != static_cast<double>(episodes.size()))
+        fail("dataset.episodes", "%s: holds %zu episodes, but its attribute total_episodes says %g; is a part missing?",
+             file.path.c_str(), episodes.size(), stated->second);
+    return episodes;
+}
 
 // Reads Minari's episodes, one after the other. The observation after the last action becomes the last row's next one.
-// Errors: dataset.shape, those of hdf5.hpp.
+// Errors: dataset.shape, those of minari_episodes() and hdf5.hpp.
 inline Rows read_minari(const Hdf5File& file) {
     Rows rows;
     const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
-    for (size_t episode = 0;; ++episode) {
+    for (const uint64_t episode : minari_episodes(file)) {
         const std::string group = "episode_" + std::to_string(episode) + "/";
-        if (!file.find(group + "observations")) return rows;
         const Hdf5Table actions = table_of(file, group + "actions");
         const uint64_t steps = actions.rows;
         const Hdf5Table states = table_of(file, group + "observations", steps + 1);
-        if (episode == 0) rows.state_dim = states.columns;
-        if (episode == 0) rows.action_dim = actions.columns;
+        if (rows.count == 0) rows.state_dim = states.columns;
+        if (rows.count == 0) rows.action_dim = actions.columns;
         const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
         if (states.columns != rows.state_dim || actions.columns != rows.action_dim || empty)
             fail(
                 "dataset.shape",
-                "%s: %sobservations and actions have %zu and %zu columns, %zu steps; episode 0 has %zu and %zu columns",
+                "%s: %sobservations and actions have %zu and %zu columns, %zu steps; the first has %zu and %zu columns",
                 file.path.c_str(), group.c_str(), size_t{states.columns}, size_t{actions.columns}, size_t{steps},
                 rows.state_dim, rows.action_dim);
         const auto column = [&](const char* name) -> const Hdf5Dataset& {
@@ -191,6 +242,7 @@ inline Rows read_minari(const Hdf5File& file) {
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
+    return rows;
 }
 
 inline Rows read_data_set(const std::string& path) {
@@ -224,19 +276,30 @@ inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& whi
     return trajectory;
 }
 
+// Returns the timeouts; of a file without them (the first versions) a flag for every `limit`-th step of an episode.
+inline std::vector<uint8_t> timeouts_of(const Rows& rows, size_t limit) {
+    if (!rows.timeouts.empty()) return rows.timeouts;
+    std::vector<uint8_t> timeouts(rows.count);
+    size_t steps = 0;  // of the episode
+    for (size_t row = 0; row < rows.count; ++row) {
+        timeouts[row] = ++steps == limit;
+        if (timeouts[row] != 0 || rows.terminals[row] != 0) steps = 0;
+    }
+    return timeouts;
+}
+
 // D4RL and ODT's code: a trajectory ends with a row whose terminals or timeouts is set. A step that is both the last
 // one allowed and a fall carries only the timeout. Rows after the last flag are no trajectory: the collection stopped.
-//   No timeouts in the file (the first versions): `limit` steps end a trajectory too.
 //   Gym sets of replay buffers: timeouts also mark the ends of collection blocks; they cut, as in D4RL.
 //   maze2d: terminals are all 0, and timeouts mark that a navigation goal was reached; the body is not reset, and the
 //   next row starts where this one ended. So the highest returns belong to trajectories that leave the rewarded goal.
 inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
+    const std::vector<uint8_t> timeouts = timeouts_of(rows, limit);
     std::vector<Trajectory> trajectories;
     std::vector<size_t> open;  // rows of the trajectory that has not ended yet
     for (size_t row = 0; row < rows.count; ++row) {
         open.push_back(row);
-        const bool full = rows.timeouts.empty() && open.size() == limit;
-        if (!rows.ends(row) && !full) continue;
+        if (rows.terminals[row] == 0 && timeouts[row] == 0) continue;
         trajectories.push_back(trajectory_of(rows, open, rows.terminals[row] != 0));
         open.clear();
     }
@@ -247,10 +310,11 @@ inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
 // with a timeout and the very last row. A trajectory ends at a terminal, where the next tuple does not start from
 // s_{t+1}, and with the last tuple. In umaze-v2 episodes go on after success, with a terminal in every row at the goal:
 // each becomes a trajectory of one step and return 1, as in ODT.
-inline std::vector<Trajectory> cut_tuples(const Rows& rows) {
+inline std::vector<Trajectory> cut_tuples(const Rows& rows, size_t limit) {
+    const std::vector<uint8_t> timeouts = timeouts_of(rows, limit);
     std::vector<size_t> tuples;
     for (size_t row = 0; row + 1 < rows.count; ++row)
-        if (rows.timeouts.empty() || rows.timeouts[row] == 0) tuples.push_back(row);
+        if (timeouts[row] == 0) tuples.push_back(row);
     const auto continues = [&](size_t row, size_t next) {
         double squared = 0;
         for (size_t i = 0; i < rows.state_dim; ++i) {
@@ -279,9 +343,9 @@ inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTa
         fail("dataset.task",
              "%s: has %zu state and %zu action numbers a step; %s has %d and %d: is it of another task?", path.c_str(),
              rows.state_dim, rows.action_dim, task.name, task.state_dim, task.action_dim);
-    std::vector<Trajectory> trajectories = task.rules == Rules::antmaze
-                                               ? cut_tuples(rows)
-                                               : cut_at_flags(rows, static_cast<size_t>(task.max_episode_steps));
+    const size_t limit = static_cast<size_t>(task.max_episode_steps);
+    std::vector<Trajectory> trajectories =
+        task.rules == Rules::antmaze ? cut_tuples(rows, limit) : cut_at_flags(rows, limit);
     if (trajectories.empty())
         fail("dataset.empty", "%s: no step is marked as the end of a trajectory, so there is none", path.c_str());
     return trajectories;

@@ -4,9 +4,10 @@
 // SPEC below is the "HDF5 File Format Specification Version 3.0" (The HDF Group); no code of theirs was used.
 // Promises: what is read is what h5py reads; every checksum of what is read is verified; no input crashes or hangs the
 // reader or makes it allocate out of proportion; every error names the file, the object, the offset and what was
-// expected there. Leaves out: attributes, compound, variable-length and other types, filters but shuffle, deflate and
-// fletcher32, soft and external links, shared messages, virtual data sets (these data sets are listed, and refused when
-// read), layout messages before version 3 (HDF5 1.6.2 and older), reading a part of the rows.
+// expected there. Leaves out: attributes but single numbers of the root group, compound, variable-length and other
+// types, filters but shuffle, deflate and fletcher32, external links, shared messages, virtual data sets (these data
+// sets are listed, and refused when read), layout messages before version 3 (HDF5 1.6.2 and older), reading a part of
+// the rows.
 #pragma once
 
 #include <memory>
@@ -396,14 +397,37 @@ struct Hdf5Dataset {
 
 struct Hdf5File {
     std::string path;
-    std::shared_ptr<const void> owner;  // of `bytes`
-    Bytes bytes;                        // the file from its superblock on; all addresses count from there
-    std::vector<Hdf5Dataset> datasets;  // sorted by path, bytewise
+    std::shared_ptr<const void> owner;              // of `bytes`
+    Bytes bytes;                                    // the file from its superblock on; all addresses count from there
+    std::vector<Hdf5Dataset> datasets;              // sorted by path, bytewise
+    std::map<std::string, std::string> links = {};  // soft and external: path -> what it leads to
+    std::map<std::string, double> attributes = {};  // of the root group, if a single number each
 
-    // Returns null if there is none.
-    const Hdf5Dataset* find(std::string_view name) const {
-        const auto found = std::ranges::lower_bound(datasets, name, {}, &Hdf5Dataset::path);
-        return found != datasets.end() && found->path == name ? &*found : nullptr;
+    // Returns the data set of this path, which may lead through links; null if there is none.
+    // Errors: hdf5.link for a link to what is not in the file.
+    const Hdf5Dataset* find(const std::string& name) const {
+        std::string at = name;
+        for (size_t followed = 0; followed < 32; ++followed) {
+            const auto found = std::ranges::lower_bound(datasets, at, {}, &Hdf5Dataset::path);
+            if (found != datasets.end() && found->path == at) return &*found;
+            size_t end = at.find('/');  // of the part of `at` that is a link
+            while (end != std::string::npos && !links.contains(at.substr(0, end))) end = at.find('/', end + 1);
+            const auto link = links.find(at.substr(0, end));
+            if (link == links.end() && followed == 0) return nullptr;
+            if (link == links.end()) break;
+            at = link->second + (end == std::string::npos ? "" : at.substr(end));
+            if (at.starts_with('/')) at.erase(0, 1);  // a link to the root group
+        }
+        fail_dataset("hdf5.link", path, name,
+                     "is a link to " + json_string(at) + ", which is no data set of this file");
+    }
+
+    // Returns the paths of all data sets and links.
+    std::vector<std::string> names() const {
+        std::vector<std::string> all;
+        for (const Hdf5Dataset& dataset : datasets) all.push_back(dataset.path);
+        for (const auto& [from, to] : links) all.push_back(from);
+        return all;
     }
 
     // Returns booleans, stored as any kind of number. Errors: those of read; hdf5.flag for anything but 0 and 1.
@@ -698,7 +722,12 @@ struct Hdf5Parser {
         return block.checked(length - 8);
     }
 
-    using Links = std::vector<std::pair<std::string, uint64_t>>;  // name, address
+    struct Link {
+        std::string name;
+        uint64_t address;               // of a hard link
+        std::optional<std::string> to;  // of a soft one: a path, from the root group if it begins with a slash
+    };
+    using Links = std::vector<Link>;
 
     // Reads the data set or group that a link leads to. A link to a named type is passed over.
     void link(const std::string& path, uint64_t address, int depth) {
@@ -714,12 +743,59 @@ struct Hdf5Parser {
             if (message.type == 0x11) symbol_table(links, message.data);
             if (message.type == 0x02) dense_links(links, message.data);
             if (message.type == 0x06) link_message(links, message.data);
+            if (message.type == 0x0C && path.empty() && (message.flags & 2) == 0) attribute(message.data);
         }
-        for (const auto& [name, child] : links) {
+        for (const auto& [name, child, to] : links) {
             if (name.empty() || has_control(name) || name.find('/') != std::string::npos)
                 damaged("hdf5.format", address, "names without slashes and control characters");
-            link(path.empty() ? name : path + "/" + name, child, depth + 1);
+            const std::string parent = path.empty() ? "" : path + "/";
+            if (!to) {
+                link(parent + name, child, depth + 1);
+                continue;
+            }
+            charge(address, 2 * parent.size() + name.size() + to->size());
+            file.links[parent + name] = plain_path(to->starts_with('/') ? *to : parent + *to);
         }
+    }
+
+    // Returns a path without the empty parts and the dots that mean nothing.
+    static std::string plain_path(const std::string& path) {
+        std::string plain;
+        for (const auto part : std::views::split(path, '/')) {
+            const std::string name(part.begin(), part.end());
+            if (!name.empty() && name != ".") plain += (plain.empty() ? "" : "/") + name;
+        }
+        return plain;
+    }
+
+    // SPEC IV.A.2.m: version | flags | sizes of name, type and space 2, 2, 2 | [character set] | the three (in version
+    // 1 each filled up to a multiple of 8) | value
+    void attribute(Cursor c) {
+        const auto [version, flags, name_size, type_size, space_size] = c.fields(1, 1, 2, 2, 2);
+        c.expect(version >= 1 && version <= 3, "an attribute of version 1 to 3");
+        c.take(version == 3 ? 1 : 0);
+        const auto part = [&](uint64_t size) {
+            Cursor whole = cursor(c.at, size);
+            c.take(version == 1 ? 8 * quotient(size, 8) : size);
+            return whole;
+        };
+        const Cursor name_at = part(name_size), type = part(type_size), space = part(space_size);
+        if (version > 1 && (flags & 3) != 0) return;  // type or space are shared with other objects
+        Grid value;
+        datatype(value, type);
+        dataspace(value, space);
+        if (value.element.kind == Hdf5Element::other || value.element.kind == Hdf5Element::text) return;
+        if (value.elements != 1) return;
+        file.attributes[text_at(name_at)] = element_value<double>(value.element, c.take(value.element.size).data());
+    }
+
+    // Returns the text from here to the NUL that ends it.
+    std::string text_at(Cursor c) {
+        const Bytes rest = file.bytes.subspan(c.at, c.end - c.at);
+        const auto end = std::ranges::find(rest, 0);
+        c.expect(end != rest.end(), "a text that ends");
+        charge(c.at, static_cast<size_t>(end - rest.begin()));
+        return {rest.begin(), end};
     }
 
     // SPEC III.A.1: a version-1 B-tree. Calls leaf(key, child) in order; only `leaf` knows what a key means.
@@ -744,35 +820,43 @@ struct Hdf5Parser {
     // SPEC IV.A.2.r: the message of an old group.
     //   message      B-tree 8 | local heap 8
     //   local heap   HEAP 0 | .. 3 | size 8 | free list 8 | names 8, each ended by a NUL                 (III.D)
-    //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 20        (III.B, III.C)
+    //   symbol node  SNOD 1 | .. | count 2 | entries: name in the heap 8, header 8, kind 4, .. 4, a soft link's path in
+    //                the heap 4, .. 12                                                                   (III.B, III.C)
     void symbol_table(Links& links, Cursor message) {
         const auto [tree, heap_address] = message.fields(8, 8);
         Cursor heap = structure(heap_address, "HEAP", 0);
         const auto [reserved, size, free, segment] = heap.fields(3, 8, 8, 8);
-        const Bytes names = cursor(segment, size).take(size);
+        Cursor names = cursor(segment, size);
+        names.take(size);
+        const auto text = [&](uint64_t at) {
+            names.expect(at < names.end - names.start, "a text within the heap");
+            return text_at(cursor(names.start + at, names.end - names.start - at));
+        };
         b_tree_1(tree, 0, 8, [&](Cursor, uint64_t node) {
             Cursor c = structure(node, "SNOD", 1);
             const auto [unused, count] = c.fields(1, 2);
             for (uint64_t n = 0; n < count; ++n) {
-                const auto [name, header, kind, scratch] = c.fields(8, 8, 4, 20);
-                c.expect(name < names.size(), "a name within the heap");
-                const Bytes rest = names.subspan(name);
-                const auto end = std::ranges::find(rest, 0);
-                c.expect(end != rest.end(), "a name that ends");
-                charge(c.at, static_cast<size_t>(end - rest.begin()));
-                if (kind != 2) links.emplace_back(std::string(rest.begin(), end), header);  // 2: a soft link
+                const auto [name, header, kind, reserved_4, target, scratch] = c.fields(8, 8, 4, 4, 4, 12);
+                links.push_back({text(name), header, {}});
+                if (kind == 2) links.back().to = text(target);  // a soft link
             }
         });
     }
 
-    // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name | address 8
+    // SPEC IV.A.2.g: 1 | flags | [type] | [order 8] | [character set] | length of the name 1..8 | name, then by type
+    //   0, hard: address 8 | 1, soft: length 2, path | 64, external: length 2, flags 1, file NUL, path NUL
     void link_message(Links& links, Cursor c) {
         const auto [version, flags] = c.fields(1, 1);
         c.expect(version == 1, "a link message of version 1");
         const uint64_t type = (flags & 8) != 0 ? c.number(1) : 0;
         c.take(((flags & 4) != 0 ? 8 : 0) + ((flags & 16) != 0 ? 1 : 0));
         const Bytes name = c.take(c.number(uint64_t{1} << (flags & 3)));
-        if (type == 0) links.emplace_back(std::string(name.begin(), name.end()), c.number(8));
+        links.push_back({std::string(name.begin(), name.end()), type == 0 ? c.number(8) : 0, {}});
+        if (type == 0) return;
+        const Bytes value = c.take(c.number(2));
+        std::string to(value.begin(), value.end());
+        std::ranges::replace(to, '\0', ' ');
+        links.back().to = type == 1 ? to : "/another file:" + to.substr(0, to.find_last_not_of(' ') + 1);
     }
 
     // SPEC III.A.2: a version-2 B-tree. Calls record(cursor) for each record.
@@ -1318,7 +1402,7 @@ class Hdf5Writer {
         const std::string start = "\x89HDF\r\n\x1a\n" + std::string(5, '\0') + "\x08\x08" + '\0' + little(leaf_k_, 2) +
                                   little(tree_k, 2) + little(0, 4 + 8) + none + little(position_, 8) + none +
                                   little(0, 8) + root;  // SPEC II.A, version 0
-        if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.temporary);
+        if (::lseek(file_.file.fd, 0, SEEK_SET) != 0) fail_file("file.write", "go back to its start", file_.path);
         file_.write(start);
         file_.commit();
     }

@@ -210,9 +210,10 @@ struct StoredModel {
 
 // The command `export --odt`: from a model file (or run folder) to `out`, which gets everything that a strict
 // load_state_dict of ODT's model expects, and nothing else. What it has no place for is text in the metadata.
-// Errors: those of open_model() and load_model(), file.write.
+// Errors: those of open_model() and load_model(), file.input, file.write.
 inline void export_odt(const std::string& given, const std::string& out) {
     const TensorFile file = open_model(given);
+    require_other_file(out, file.path);
     StoredModel model{settings_in(file)};
     ModelContents contents = model.contents();
     load_model(contents, file);
@@ -240,10 +241,12 @@ inline void export_odt(const std::string& given, const std::string& out) {
 }
 
 // The command `import`: from a file of ODT's code or of export_odt() to a model file. find_statistics(model) is called
-// if the file has none of the states. Errors: model.*, import.*, safetensors.*.
+// if the file has none of the states. Errors: model.*, import.*, file.input, safetensors.*.
 template <class FindStatistics>
 void import_odt(const TensorFile& file, const Settings& settings, const std::string& out,
                 FindStatistics&& find_statistics) {
+    require_other_file(out, file.path);
+    require_other_file(out, settings.dataset_path);
     require_room(file, settings);
     StoredModel model{settings};
     ModelContents contents = model.contents();

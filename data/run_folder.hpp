@@ -224,9 +224,10 @@ struct FolderLock {
     }
 };
 
-// A folder may be new, hold this very run, or hold another run, which is then left as it is.
+// A folder, which must be locked, may be new, hold this very run, or hold another run, which is then left as it is.
 // Errors: run.folder, run.other_settings.
 inline void claim_folder(const RunFolder& folder, const Settings& settings) {
+    remove_temporaries(folder.path);
     const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors");
     if (!folder.has("settings") && has_run)
         fail("run.folder", "%s holds a run without its settings file; choose another folder with --out",
@@ -297,8 +298,7 @@ struct CheckpointTimer {
 };
 
 inline void remove_checkpoint(const RunFolder& folder) {
-    for (const char* name : {"checkpoint.safetensors", "checkpoint.safetensors.tmp"})
-        std::filesystem::remove(folder.file(name));
+    std::filesystem::remove(folder.file("checkpoint.safetensors"));
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -1,8 +1,9 @@
 // safetensors.hpp: bytes to and from disk. Whole files, logs that only grow, and safetensors, the format of models,
 // checkpoints and golden vectors (any version of the `safetensors` Python package opens them).
 // Promises: equal contents give equal bytes; no input crashes the reader or makes it allocate out of proportion; a
-// write that fails leaves the old file as it was; every error names the file and the tensor or offset. Leaves out:
-// dtypes that nothing here needs, memory mapping, big-endian machines, two processes writing one path.
+// write that fails leaves the old file as it was; of two processes that write one path, the last to finish wins; every
+// error names the file and the tensor or offset. Leaves out: dtypes that nothing here needs, memory mapping, big-endian
+// machines.
 #pragma once
 
 #include <fcntl.h>
@@ -12,6 +13,7 @@
 #include <bit>
 #include <cerrno>
 #include <charconv>
+#include <filesystem>
 #include <optional>
 #include <ranges>
 #include <span>
@@ -105,25 +107,58 @@ inline std::string read_file(const std::string& path, size_t limit = size_t{1} <
     return bytes;
 }
 
-// A file that appears as a whole: other programs see the old file or the complete new one. Bytes go to PATH.tmp until
-// commit() renames it; without commit() the temporary is removed. One left by a killed process is overwritten.
+// Returns the path of the regular file, there or not yet, that writing to `path` makes or replaces: symbolic links are
+// followed. Errors: file.not_regular for a folder, pipe or device, file.write for links in a circle.
+inline std::string written_path(const std::string& path) {
+    namespace fs = std::filesystem;
+    std::error_code none;  // what cannot be looked at is not there; creating it then says why
+    fs::path at = path;
+    for (int links = 0; fs::is_symlink(at, none); ++links) {
+        if (links == 40) fail("file.write", "%s: its symbolic links lead in a circle", path.c_str());
+        at = at.parent_path() / fs::read_symlink(at, none);
+    }
+    if (fs::exists(at, none) && !fs::is_regular_file(at, none))
+        fail("file.not_regular", "%s: is not a regular file; it is left as it is, give another path to write to",
+             path.c_str());
+    return at;
+}
+
+// Errors: file.input, if writing to `out` would replace the file `input`; those of written_path().
+inline void require_other_file(const std::string& out, const std::string& input) {
+    std::error_code none;
+    if (std::filesystem::equivalent(written_path(out), input, none))
+        fail("file.input", "%s: is the file %s that is read; give another path to write to", out.c_str(),
+             input.c_str());
+}
+
+// A file that appears as a whole: other programs see the old file or the complete new one. Bytes go to PATH.N.tmp,
+// where N is the first number from the process's own on that is free, until commit() renames it; without commit() the
+// temporary is removed. One that a killed process leaves is nobody's: see remove_temporaries.
+// Errors: file.write, those of written_path().
 struct AtomicFile {
-    std::string path, temporary = path + ".tmp";
-    File file{temporary, O_WRONLY | O_CREAT | O_TRUNC, "file.write", "create it"};
+    std::string path, target = written_path(path), temporary = free_name(target);
+    File file{temporary, O_WRONLY | O_CREAT | O_EXCL, "file.write", "create it"};
     bool renamed = false;
 
-    explicit AtomicFile(const std::string& path_) : path(path_) {}
+    explicit AtomicFile(const std::string& path_) : path(path_) { file.path = path; }
+    static std::string free_name(const std::string& beside) {
+        const auto name = [&](pid_t n) { return beside + "." + std::to_string(n) + ".tmp"; };
+        std::error_code none;
+        pid_t n = ::getpid();
+        while (std::filesystem::exists(name(n), none)) ++n;
+        return name(n);
+    }
     ~AtomicFile() {
         if (!renamed) ::unlink(temporary.c_str());
     }
     void write(std::string_view bytes) const { file.write(bytes); }
     void commit() {
         file.sync();
-        if (::rename(temporary.c_str(), path.c_str()) != 0)
+        if (::rename(temporary.c_str(), target.c_str()) != 0)
             fail_file("file.write", "rename its temporary file to it", path);
         renamed = true;
         // Until the folder is flushed, a power cut may bring the old name back.
-        const std::string parent = path.substr(0, path.find_last_of('/') + 1);
+        const std::string parent = target.substr(0, target.find_last_of('/') + 1);
         const File folder(parent.empty() ? "." : parent, O_RDONLY | O_DIRECTORY, "file.write",
                           "open the folder to flush it");
         // EINVAL: this file system has no such operation.
@@ -136,6 +171,19 @@ inline void write_file_atomic(const std::string& path, std::string_view bytes) {
     AtomicFile file(path);
     file.write(bytes);
     file.commit();
+}
+
+// Removes the temporaries that killed processes left in a folder in which no other process writes now.
+inline void remove_temporaries(const std::string& folder) {
+    std::error_code none;
+    std::vector<std::filesystem::path> found;
+    for (const auto& entry : std::filesystem::directory_iterator(folder, none)) {
+        const std::filesystem::path number = entry.path().stem().extension();  // of NAME.N.tmp: ".N"
+        const std::string digits = number.string().substr(std::min<size_t>(number.string().size(), 1));
+        const bool all_digits = digits.find_first_not_of("0123456789") == std::string::npos;
+        if (entry.path().extension() == ".tmp" && !digits.empty() && all_digits) found.push_back(entry.path());
+    }
+    for (const std::filesystem::path& temporary : found) std::filesystem::remove(temporary, none);
 }
 
 // A log that grows. append() gives text to the system at once (no buffer), sync() brings it to the disk. A checkpoint

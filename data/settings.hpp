@@ -5,6 +5,7 @@
 // A run folder's file `settings` and a model's metadata hold the text form, one line a setting:
 //
 //   name = value                            # source
+//   name = "value"                          # source: with \xHH for bytes that would not read back as they are
 //
 // Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
 // an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
@@ -28,6 +29,7 @@
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
 #include "../nn.hpp"
+#include "safetensors.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Text.
@@ -413,11 +415,42 @@ inline void check_together(const Settings& settings) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The text form.
 
+// Returns the value as it is, or between quotes if it would not read back so: a file's name may hold any byte but NUL.
+inline std::string quoted(const std::string& value) {
+    const bool utf8 = is_utf8(value);
+    const auto special = [&](char c) { return is_control(c) || c == '"' || c == '#' || (c < 0 && !utf8); };
+    if (!value.empty() && trimmed(value) == value && std::ranges::none_of(value, special)) return value;
+    std::string text;
+    for (const char c : value)
+        text += special(c) || c == '\\' ? "\\x" + hex8(static_cast<uint8_t>(c)).substr(6) : std::string(1, c);
+    return '"' + text + '"';
+}
+
+// The inverse of quoted(). A text that it cannot have written is a value as it is: earlier versions had no quotes.
+inline std::string unquoted(const std::string& text) {
+    if (text.size() < 2 || text.front() != '"' || text.back() != '"') return text;
+    std::string value;
+    for (size_t at = 1; at + 1 < text.size(); ++at) {
+        if (text[at] == '"') return text;
+        if (text[at] == '\\') {
+            const std::string_view code = std::string_view(text).substr(at, 4);  // \xHH
+            uint8_t byte = 0;
+            const char* const end = code.data() + code.size();
+            if (!code.starts_with("\\x") || std::from_chars(code.data() + 2, end, byte, 16).ptr != end) return text;
+            value += static_cast<char>(byte);
+            at += 3;
+        } else {
+            value += text[at];
+        }
+    }
+    return value;
+}
+
 inline std::string settings_text(const Settings& settings) {
     std::string text;
     for (const SettingRow& row : setting_rows) {
         const auto source = settings.source.find(row.name);
-        std::string line = std::string(row.name) + " = " + setting_text(settings, row);
+        std::string line = std::string(row.name) + " = " + quoted(setting_text(settings, row));
         line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
         text += line + "# " + (source == settings.source.end() ? row.source : source->second) + "\n";
     }
@@ -449,6 +482,7 @@ inline std::vector<Setting> parse_settings(const std::string& text, const std::s
         if (std::any_of(out.begin(), out.end(), [&](const Setting& other) { return other.name == setting.name; }))
             fail("settings.repeated", "%s: line %zu: \"%s\" was set before; keep one of the lines", path.c_str(), line,
                  setting.name.c_str());
+        setting.value = unquoted(setting.value);
         out.push_back(setting);
     }
     return out;
@@ -475,7 +509,8 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
 inline void require_same_settings(const Settings& found, const Settings& wanted, const std::string& where) {
     for (const SettingRow& row : setting_rows) {
         const std::string was = setting_text(found, row), now = setting_text(wanted, row);
-        if (was == now) continue;
+        const bool same_data = found.dataset_sha256 == wanted.dataset_sha256;  // whatever the file is called
+        if (was == now || (row.name == std::string_view("dataset") && same_data)) continue;
         const bool kernel = std::string(row.name) == "arithmetic";
         fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
              row.name, was.c_str(), now.c_str(),

@@ -140,7 +140,7 @@ void dump_update(Run& run, const std::string& path) {
                 static_cast<unsigned long long>(run.progress.updates + 1), dump.file.tensors.size());
 }
 
-// Errors: dump.weights; those of the data set.
+// Errors: dump.weights, file.input; those of the data set.
 void dump_run(const std::string& path, RunFolder folder, const Arguments& arguments) {
     Settings settings = settings_from_text(read_file(folder.file("settings"), 1 << 20), folder.file("settings"));
     const bool resumes = folder.has("checkpoint.safetensors");
@@ -156,6 +156,9 @@ void dump_run(const std::string& path, RunFolder folder, const Arguments& argume
             fail("dump.dataset", "%s is not the data set of %s, whose SHA-256 is %s; give it by --dataset",
                  settings.dataset_path.c_str(), folder.path.c_str(), settings.dataset_sha256.c_str());
     }
+    for (const std::string& input :
+         {folder.file("settings"), folder.file("checkpoint.safetensors"), settings.dataset_path})
+        require_other_file(path, input);
     Compute compute(kernel_for(settings.arithmetic), thread_count(arguments));
     Run run(compute, settings, *make_environment(settings));
     if (resumes)

@@ -1,4 +1,5 @@
-// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; and the search for a file.
+// test_d4rl.cpp: trajectories out of a data set's rows, by hand-made rows for every rule; the search for a file, and
+// its name among the settings.
 #include <unistd.h>
 
 #include "../data/d4rl.hpp"
@@ -83,6 +84,102 @@ TEST(episodes_of_minari_become_rows_and_each_ends_a_trajectory) {
     std::filesystem::remove_all(folder);
 }
 
+namespace {
+
+// A file of hand-made data sets, removed at its end.
+struct MadeFile {
+    std::string folder = [] {
+        char name[] = "/tmp/wodtem-test-XXXXXX";
+        return std::string(mkdtemp(name));
+    }();
+    std::string path = folder + "/made.hdf5";
+    ~MadeFile() { std::filesystem::remove_all(folder); }
+
+    // Each data set has a column of 1, 2, ..., or flags.
+    Hdf5File with(const std::map<std::string, uint64_t>& columns,
+                  const std::map<std::string, std::vector<uint8_t>>& flags) const {
+        Hdf5Writer out(path);
+        for (const auto& [name, rows] : columns) {
+            std::vector<float> values(rows);
+            std::iota(values.begin(), values.end(), 1.0f);
+            out.add(name, {rows, 1}, values);
+        }
+        for (const auto& [name, values] : flags) out.add(name, {values.size()}, values);
+        out.close();
+        return open_hdf5(path);
+    }
+};
+
+}  // namespace
+
+TEST(episodes_of_minari_whose_numbers_have_gaps_are_all_read) {
+    const MadeFile made_file;
+    std::map<std::string, uint64_t> columns;
+    std::map<std::string, std::vector<uint8_t>> flags;
+    for (const auto& [episode, steps] : std::map<int, uint64_t>{{2, 1}, {10, 3}, {7, 2}}) {
+        const std::string group = "episode_" + std::to_string(episode) + "/";
+        columns[group + "observations"] = steps + 1;
+        columns[group + "actions"] = columns[group + "rewards"] = steps;
+        flags[group + "terminations"] = flags[group + "truncations"] = std::vector<uint8_t>(steps, 0);
+    }
+    Hdf5File file = made_file.with(columns, flags);
+    CHECK(is_minari(file));
+    const Rows rows = read_minari(file);
+    CHECK(rows.observations == (std::vector<float>{1, 1, 2, 1, 2, 3}));  // episodes 2, 7 and 10
+    CHECK(rows.timeouts == (std::vector<uint8_t>{1, 0, 1, 0, 0, 1}));
+    file.attributes["total_episodes"] = 3;
+    CHECK_EQUAL(read_minari(file).count, size_t{6});
+    for (const double stated : {2.0, 4.0, 0.0}) {
+        file.attributes["total_episodes"] = stated;
+        CHECK_FAILS("dataset.episodes", read_minari(file));
+    }
+    columns["episode_3/infos/x"] = 1;  // an episode of which a part is missing
+    CHECK_FAILS("dataset.shape", read_minari(made_file.with(columns, flags)));
+    columns.erase("episode_3/infos/x");
+    for (const char* stray : {"episode_03/observations", "episode_x/observations", "observations"}) {
+        std::map<std::string, uint64_t> more = columns;
+        more[stray] = 2;
+        CHECK_FAILS("dataset.column", read_minari(made_file.with(more, flags)));
+    }
+    columns.erase("episode_2/observations");
+    columns["episode_2/observations/achieved_goal"] = 2;
+    try {
+        read_minari(made_file.with(columns, flags));
+    } catch (const Error& error) {
+        CHECK(std::string(error.what())
+                  .ends_with("\"episode_2/observations\" is a group; write one table of numbers "
+                             "instead"));
+    }
+}
+
+TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
+    const MadeFile made_file;
+    const std::map<std::string, uint64_t> columns = {{"observations", 6}, {"actions", 6}, {"rewards", 6}};
+    using Flags = std::vector<uint8_t>;
+    const Flags terminals = {0, 1, 0, 0, 0, 0}, ends = {0, 1, 0, 1, 0, 1};
+    // d3rlpy 1's ends include those that the task set, which are no timeouts.
+    const Rows rows = read_rows(made_file.with(columns, {{"terminals", terminals}, {"episode_terminals", ends}}));
+    CHECK(rows.timeouts == (Flags{0, 0, 0, 1, 0, 1}));
+    std::string lengths;
+    for (const Trajectory& trajectory : cut_at_flags(rows, 1000))
+        lengths += std::to_string(trajectory.length()) + (trajectory.terminated ? "! " : " ");
+    CHECK_EQUAL(lengths, "2! 2 2 ");
+    CHECK(read_rows(made_file.with(columns, {{"terminals", terminals}})).timeouts.empty());
+    CHECK(read_rows(made_file.with(columns, {{"terminals", terminals}, {"timeouts", ends}})).timeouts == ends);
+    for (const char* name : {"episode_terminals", "truncations", "dones"}) {
+        try {
+            read_rows(made_file.with(columns, {{"terminals", terminals}, {"timeouts", ends}, {name, ends}}));
+            CHECK(!"read");
+        } catch (const Error& error) {
+            CHECK_EQUAL(error.id, "dataset.column");
+            CHECK(std::string(error.what()).find("\"" + std::string(name) + "\" has a row for each") !=
+                  std::string::npos);
+        }
+    }
+    // Of another length, or below a group, it is no column of the table.
+    read_rows(made_file.with(columns, {{"terminals", terminals}, {"version", {1}}, {"infos/dones", ends}}));
+}
+
 TEST(trajectories_end_at_terminals_and_timeouts_and_a_tail_without_a_flag_is_none) {
     const Rows rows = made({5, 6, 7, 8, 9, 1, 2, 3}, {0, 0, 1, 0, 0, 0, 0, 0}, {0, 0, 0, 0, 0, 1, 0, 0});
     CHECK_EQUAL(shown(cut_at_flags(rows, 1000)), "0 1 2! | 3 4 5");
@@ -106,14 +203,22 @@ TEST(without_timeouts_the_time_limit_ends_a_trajectory_too) {
 // Rows 2 and 6 (timeouts) and 7 (the last) are no tuples; 1 does not lead to 3, 4 ends by itself, 5 is the last tuple.
 TEST(antmaze_is_cut_where_tuples_do_not_go_on_and_at_every_terminal) {
     CHECK_EQUAL(
-        shown(cut_tuples(made({0, 1, 2, 10, 11, 12, 13, 20}, {0, 0, 0, 0, 1, 0, 0, 0}, {0, 0, 1, 0, 0, 0, 1, 0}))),
+        shown(cut_tuples(made({0, 1, 2, 10, 11, 12, 13, 20}, {0, 0, 0, 0, 1, 0, 0, 0}, {0, 0, 1, 0, 0, 0, 1, 0}), 700)),
         "0 1 | 3 4! | 5");
     // Success goes on: each row at the goal is a trajectory of its own, as in ODT.
-    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 3, 4, 5}, {0, 0, 1, 1, 1, 0}, {0, 0, 0, 0, 0, 0}))),
+    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 3, 4, 5}, {0, 0, 1, 1, 1, 0}, {0, 0, 0, 0, 0, 0}), 700)),
                 "0 1 2! | 3! | 4!");
     // A timeout whose next episode starts where its next row stood joins them: only states tell.
-    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 2, 3, 4}, {0, 0, 0, 0, 0, 0}, {0, 0, 1, 0, 0, 0}))), "0 1 3 4");
-    CHECK_EQUAL(shown(cut_tuples(made({0}, {0}, {0}))), "");
+    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 2, 3, 4}, {0, 0, 0, 0, 0, 0}, {0, 0, 1, 0, 0, 0}), 700)), "0 1 3 4");
+    CHECK_EQUAL(shown(cut_tuples(made({0}, {0}, {0}), 700)), "");
+    // Without timeouts every third step of an episode is one: 2, and 6, for 3 ends an episode.
+    CHECK_EQUAL(shown(cut_tuples(made({0, 1, 2, 10, 20, 21, 22, 30, 31}, {0, 0, 0, 1, 0, 0, 0, 0, 0}, {}), 3)),
+                "0 1 | 3! | 4 5 | 7");
+    MujocoTask tiny = *find_mujoco_task("antmaze-umaze");
+    tiny.state_dim = tiny.action_dim = 1;
+    tiny.max_episode_steps = 3;
+    CHECK_EQUAL(cut_trajectories(made({0, 1, 2, 10, 11, 12, 20, 21}, {0, 0, 0, 0, 0, 0, 0, 0}, {}), tiny, "f").size(),
+                size_t{3});
 }
 
 TEST(statistics_count_dead_columns_repetitions_and_jumps) {
@@ -200,4 +305,31 @@ TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
     std::filesystem::remove_all(folder);
     CHECK(find_published("maze2d-huge-v1") == nullptr);
     for (const PublishedDataSet& one : published_data_sets) CHECK(find_mujoco_task(one.id) != nullptr);
+}
+
+TEST(any_name_of_a_data_set_is_read_back_and_its_checksum_alone_tells_data_apart) {
+    Settings settings;
+    constexpr const char* names =  // between bars
+        "plain.hdf5|my set # 2.hdf5| a|a |a\t|a\nseed = 1 # x||#|\"|\"a\"|a\"b # c|\\|\\x41|\"\\x41\"|\x7f\x1b[31m|"
+        "M\u00e4\u4e2d # .h5|\xff\xfe|a = b|a#b|none # ";
+    for (const std::string& name : split(names, '|')) {
+        settings.dataset = name;
+        const std::string text = settings_text(settings);
+        CHECK_EQUAL(settings_from_text(text, "f").dataset, name);
+        CHECK(is_utf8(text) && std::ranges::count(text, '\n') == std::ranges::count(settings_text({}), '\n'));
+        CHECK_EQUAL(settings_text(settings_from_text(text, "f")), text);
+    }
+    CHECK_EQUAL(quoted("my set.hdf5"), "my set.hdf5");  // as before
+    CHECK_EQUAL(quoted("a\\b"), "a\\b");
+    CHECK_EQUAL(quoted(" M\u00e4 # 2\n"), "\" M\u00e4 \\x23 2\\x0a\"");
+    for (const char* earlier : {"\"", "\"a", "\"a\" b", "\"a\"b\"", "\"\\\"", "\"\\x4\"", "\"\\x4g\"", "\"\\y41\""})
+        CHECK_EQUAL(unquoted(earlier), earlier);  // what earlier versions wrote for such names
+
+    Settings renamed = settings;
+    renamed.dataset = "another name";
+    require_same_settings(settings, renamed, "f");
+    renamed.dataset_sha256 = "0123";
+    CHECK_FAILS("run.other_settings", require_same_settings(settings, renamed, "f"));
+    renamed.dataset = settings.dataset;
+    CHECK_FAILS("run.other_settings", require_same_settings(settings, renamed, "f"));
 }

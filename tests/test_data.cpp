@@ -5,6 +5,7 @@
 
 #include <csignal>
 #include <filesystem>
+#include <set>
 
 #include "../data/figures.hpp"
 #include "../data/safetensors.hpp"
@@ -18,6 +19,12 @@ struct Folder {
     Folder() { std::filesystem::create_directories(path); }
     ~Folder() { std::filesystem::remove_all(path); }
     std::string operator/(const std::string& name) const { return (path / name).string(); }
+    std::set<std::string> names() const {  // of all below it
+        std::set<std::string> found;
+        for (const auto& entry : std::filesystem::recursive_directory_iterator(path))
+            found.insert(entry.path().lexically_relative(path));
+        return found;
+    }
 };
 
 // The eight bytes of a length, then the header, then the data: nothing of ours is used.
@@ -273,19 +280,77 @@ TEST(file_is_written_whole_or_not_at_all) {
         try {
             write_file_atomic(path, std::string(10000, 'x'));
         } catch (const Error& error) {
-            ::_exit(error.id == "file.write" && error.what() == path + ".tmp: cannot write it: File too large" ? 7 : 1);
+            ::_exit(error.id == "file.write" && error.what() == path + ": cannot write it: File too large" ? 7 : 1);
         }
         ::_exit(0);
     }
     int status = 0;
     CHECK(::waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 7);
     CHECK_EQUAL(read_file(path), "old");
-    CHECK(!std::filesystem::exists(path + ".tmp"));
+    CHECK(folder.names() == std::set<std::string>{"model.safetensors"});
 
     CHECK_FAILS("file.write", write_file_atomic(folder / "missing/file", "x"));
-    std::filesystem::create_directories(folder / "taken");  // rename() onto a folder fails at the last moment
-    CHECK_FAILS("file.write", write_file_atomic(folder / "taken", "x"));
-    CHECK(!std::filesystem::exists(folder / "taken.tmp"));
+    CHECK_FAILS("file.write", AtomicFile file(folder / "taken");
+                std::filesystem::create_directories(folder / "taken");  // so rename() fails, at the last moment
+                file.commit());
+    CHECK(folder.names() == (std::set<std::string>{"model.safetensors", "taken"}));
+}
+
+TEST(writing_follows_links_and_leaves_what_is_no_regular_file) {
+    namespace fs = std::filesystem;
+    const Folder folder;
+    fs::create_directories(folder / "elsewhere");
+    write_file_atomic(folder / "elsewhere/there", "old");
+    fs::create_symlink("elsewhere/there", folder / "link");
+    fs::create_symlink("link", folder / "link_of_link");
+    fs::create_symlink(folder / "elsewhere/new", folder / "dangling");
+    write_file_atomic(folder / "link_of_link", "through two links");
+    write_file_atomic(folder / "dangling", "where nothing was");
+    CHECK_EQUAL(read_file(folder / "elsewhere/there"), "through two links");
+    CHECK_EQUAL(read_file(folder / "elsewhere/new"), "where nothing was");
+    fs::create_symlink("circle", folder / "circle");
+    CHECK_FAILS("file.write", write_file_atomic(folder / "circle", "x"));
+    CHECK_EQUAL(::mkfifo((folder / "pipe").c_str(), 0600), 0);
+    fs::create_symlink("pipe", folder / "to_pipe");
+    for (const char* name : {"pipe", "to_pipe", "elsewhere"})
+        CHECK_FAILS("file.not_regular", write_file_atomic(folder / name, "x"));
+    for (const char* name : {"link", "link_of_link", "dangling", "circle", "to_pipe"})
+        CHECK(fs::is_symlink(folder / name));
+    CHECK(fs::is_fifo(folder / "pipe"));
+    CHECK_EQUAL(folder.names().size(), size_t{9});
+
+    require_other_file(folder / "another", folder / "link");
+    require_other_file(folder / "another", "");
+    for (const char* out : {"link", "elsewhere/there", "elsewhere/../elsewhere/there"})
+        for (const char* input : {"link_of_link", "elsewhere/there"})
+            CHECK_FAILS("file.input", require_other_file(folder / out, folder / input));
+    CHECK_FAILS("file.not_regular", require_other_file(folder / "pipe", folder / "link"));
+}
+
+TEST(of_two_writers_of_one_file_the_last_to_finish_wins) {
+    const Folder folder;
+    const std::string path = folder / "file", pid = std::to_string(::getpid());
+    {
+        AtomicFile first(path);
+        AtomicFile second(path), third(path);
+        CHECK_EQUAL(first.temporary, path + "." + pid + ".tmp");
+        first.write("first, ");
+        second.write("second, ");
+        third.write("third");
+        first.write("whole");
+        second.write("whole");
+        second.commit();
+        CHECK_EQUAL(read_file(path), "second, whole");
+        first.commit();
+        CHECK_EQUAL(read_file(path), "first, whole");
+    }
+    CHECK(folder.names() == std::set<std::string>{"file"});
+
+    for (const char* name : {"file.123.tmp", "file.tmp", "123.tmp", "notes.v1.tmp", "x.y.7.tmp"})
+        AppendFile(folder / name).append("x");
+    remove_temporaries(folder.path);  // what a killed process left, and no other file
+    CHECK(folder.names() == (std::set<std::string>{"file", "file.tmp", "123.tmp", "notes.v1.tmp"}));
+    remove_temporaries(folder / "missing");
 }
 
 TEST(file_reader_refuses_what_is_no_regular_file) {

@@ -94,6 +94,7 @@ bool survives(const std::string& bytes) {
                 if (!error.id.starts_with("hdf5.")) return false;
             }
         }
+        for (const std::string& name : file.names()) file.find(name);
         return true;
     } catch (const Error& error) {
         return error.id.starts_with("hdf5.");
@@ -239,7 +240,8 @@ TEST(hdf5_files_made_by_h5py_are_read) {
         CHECK_EQUAL(type("types/bool"), "bool");
         CHECK_EQUAL(type("types/enumeration"), "enumeration uint16");
         CHECK_EQUAL(type("text/scalar"), "text of 13 bytes");
-        CHECK_EQUAL(type("strange/soft"), "none");
+        CHECK_EQUAL(type("strange/soft"), "float32");
+        CHECK_FAILS("hdf5.link", file.find("strange/external"));
         CHECK_EQUAL(type("strange/named"), "none");
         CHECK(file.find("types/scalar")->shape.empty());
         CHECK(file.find("types/none")->shape == (Shape{0, 4}));
@@ -260,6 +262,27 @@ TEST(hdf5_files_made_by_h5py_are_read) {
         }
         CHECK_FAILS("hdf5.type", file.read_floats(*file.find("text/scalar")));
         CHECK_EQUAL(type("text/two"), "text of 2 bytes");
+    }
+}
+
+TEST(hdf5_soft_links_and_attributes_of_the_root_are_read) {
+    for (const char* name : {"root_old", "root_latest"}) {
+        const Hdf5File file = parse(fixture(name));
+        check_contents(name, file, 1);
+        CHECK(file.attributes == (std::map<std::string, double>{{"total_episodes", 12}, {"half", 0.5}}));
+        CHECK_EQUAL(file.links.size(), size_t{8});
+        CHECK_EQUAL(file.names().size(), size_t{9});
+        for (const char* path : {"a", "group/b", "group/c", "alias/a", "alias_of_alias/c", "self/self/alias/b"})
+            CHECK(file.find(path) == &file.datasets[0]);
+        CHECK(file.find("group") == nullptr && file.find("b") == nullptr);
+        for (const char* path : {"gone", "circle", "alias/d", "self/gone"}) CHECK_FAILS("hdf5.link", file.find(path));
+    }
+    try {
+        parse(fixture("latest")).find("strange/external");
+    } catch (const Error& error) {
+        CHECK_EQUAL(std::string(error.what()),
+                    "test: \"strange/external\": is a link to \"another file: elsewhere.hdf5 /x\", which is no data "
+                    "set of this file");
     }
 }
 
@@ -366,7 +389,7 @@ TEST(hdf5_files_cut_off_anywhere_give_errors) {
 TEST(hdf5_files_changed_at_random_give_errors_or_values) {
     const Random random{test_seed(), 9};
     uint64_t step = 0;
-    for (const char* name : {"small_old", "small_latest", "minari", "superblock2"}) {
+    for (const char* name : {"small_old", "small_latest", "minari", "superblock2", "root_old", "root_latest"}) {
         const std::string whole = fixture(name);
         const auto structures = checksummed(whole);
         std::vector<uint64_t> addresses = {undefined_address, whole.size() - 1, uint64_t{1} << 63, 0};
@@ -423,7 +446,7 @@ TEST(hdf5_writer_makes_files_that_the_reader_reads) {
         out.close();
     };
     write();
-    CHECK(!std::filesystem::exists(path + ".tmp"));
+    CHECK_EQUAL(std::distance(std::filesystem::directory_iterator(folder.path), {}), ptrdiff_t{1});
     const Hdf5File file = open_hdf5(path);
     check_contents("written", file, 49);
     CHECK_EQUAL(file.find("observations")->type, "float32");
@@ -466,7 +489,7 @@ TEST(hdf5_writer_refuses_what_does_not_fit) {
             for (int i = 0; i < 1000; ++i) add(out, std::to_string(i), {3});
             out.close();
         } catch (const Error& error) {
-            ::_exit(error.id == "file.write" && error.what() == path + ".tmp: cannot write it: File too large" ? 7 : 1);
+            ::_exit(error.id == "file.write" && error.what() == path + ": cannot write it: File too large" ? 7 : 1);
         }
         ::_exit(0);
     }

@@ -1133,7 +1133,7 @@ TEST(an_impossible_folder_or_a_full_disk_is_a_sentence) {
     int status = 0;
     waitpid(child, &status, 0);
     CHECK_EQUAL(WEXITSTATUS(status), 42);
-    CHECK(!fs::exists(scratch / "full/checkpoint.safetensors.tmp"));
+    for (const auto& entry : fs::directory_iterator(scratch / "full")) CHECK(entry.path().extension() != ".tmp");
     quiet_train(tiny_settings("wodtem"), scratch / "full");
     CHECK(fs::exists(scratch / "full/finished"));
 }
@@ -1300,6 +1300,12 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     const Table progress = parse_csv(read_file(scratch / "whole/progress.csv"), "progress.csv");
     CHECK_EQUAL(progress.rows[0][0], "offline");
     CHECK(std::stod(progress.rows[0][5]) > 0);  // something was learned from
+    stop_requested = 1;
+    CHECK_FAILS("run.stopped", quiet_train(settings, scratch / "renamed", 2));
+    stop_requested = 0;
+    settings.dataset = " my set # 2\n.hdf5";  // another name for the same data: the same run
+    quiet_train(settings, scratch / "renamed", 2);
+    check_shell("./wodtem eval " + scratch / "renamed", 0, "over 1 episode");
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
 
@@ -1314,7 +1320,8 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
                     (scratch / "x.hdf5"),
                 1, "has 17 inputs and 6 actions, expected 11 and 3");
     check_shell("./wodtem collect hopper-medium --policy README.md --out " + (scratch / "x.hdf5"), 1, "README.md");
-    CHECK(!fs::exists(scratch / "x.hdf5") && !fs::exists(scratch / "x.hdf5.tmp"));
+    check_shell("./wodtem collect hopper-medium --policy " + data + " --out " + data, 1, "that is read");
+    for (const auto& entry : fs::directory_iterator(scratch.path)) CHECK(entry.path().stem() != "x");
     check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  85,000 updates of 5 ms");
     check_shell("./wodtem collect maze2d-umaze --steps 0", 2, "nearest is 1");
 }
@@ -1524,6 +1531,8 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
     CHECK(!file.has("log_temperature") && !file.has("state_mean"));  // strict loading would refuse them
     CHECK_EQUAL(file.tensors.size(), golden_tensors.size() - 3 + 8);
     check_shell("./wodtem import " + odt + " " + back, 0, "gridworld, wodtem");
+    check_shell("./wodtem export --odt " + back + " " + back, 1, "that is read");
+    check_shell("./wodtem import " + odt + " " + odt, 1, "that is read");
     CHECK(read_file(scratch / "model.safetensors") == read_file(back));
 
     // As another program would write it: no metadata; the statistics as tensors, or left to the data set.
@@ -1590,6 +1599,8 @@ TEST(a_run_can_begin_with_a_models_weights) {
                     settings.weights_path + " --out " + scratch / "run",
                 0, "1 updates");
     CHECK(read_file(scratch / "run/settings").find(sha256_of_file(settings.weights_path)) != std::string::npos);
+    check_shell("./wodtem train gridworld --weights " + scratch / "run" + " --out " + scratch / "run", 1,
+                "that is read");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1645,6 +1656,9 @@ TEST(a_run_folder_is_dumped_at_its_first_update_or_its_next) {
     check_shell("./wodtem check --dump " + path + " --run " + scratch / "unfinished", 0, "update 3, ");
     check_shell("./wodtem check " + path, 0, "1 cases, 0 failed");
     CHECK(fs::exists(scratch / "unfinished/checkpoint.safetensors"));
+    for (const char* input : {"settings", "checkpoint.safetensors"})
+        check_shell("./wodtem check --dump " + scratch / "unfinished/" + input + " --run " + scratch / "unfinished", 1,
+                    "that is read");
     check_shell("./wodtem check --dump " + path, 2, "--run DIR");
     check_shell("./wodtem check", 2, "vector files");
     check_shell("./wodtem check --dump " + path + " --run " + scratch / "nothing", 1, "nothing/settings");

@@ -225,6 +225,18 @@ def minari(f):
         put(g, "infos/qpos", (21 + e, 3), "f8", compression="gzip")
 
 
+def root(f):  # attributes of the root group, of which single numbers are read; soft links of every kind
+    f.attrs["total_episodes"] = 12
+    f.attrs["half"] = np.array([0.5], ">f4")
+    f.attrs["algorithm"] = "SAC"
+    f.attrs["fixed"] = np.bytes_("SAC")
+    f.attrs["several"] = np.arange(3)
+    put(f, "group/a", (3,), "f4")
+    for path, to in [("a", "/group/a"), ("group/b", "a"), ("group/./c", "/alias/.//b"), ("alias", "group"),
+                     ("alias_of_alias", "/alias"), ("self", "/"), ("gone", "/nowhere"), ("circle", "circle")]:
+        f[path] = h5py.SoftLink(to)
+
+
 def skewed():  # no HDF5: 4180 bytes, byte k Fibonacci(k + 1) times, so that codes have up to 15 bits
     a, b, text = 1, 1, b""
     for k in range(17):
@@ -254,6 +266,8 @@ if suffix == "":
     make("many_old", many)
     make("many_latest", many, libver="latest")
     make("long_names", long_names, libver="latest")
+    make("root_old", root)
+    make("root_latest", root, libver="latest")
     make("minari", minari, track_order=True)
     make("edges", edges, libver="latest")
     make("superblock1", short, istore_k=16)
