@@ -62,7 +62,7 @@ inline const Option option_table[] = {
     {"check", "--dump", "FILE", "", "write every tensor of one update of a run instead, as a case of topic step"},
     {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
     {"train eval import sweep bench check", "--kernel", "NAME", "auto",
-     "of matrix products: avx512, avx2, portable; auto: the best there is"},
+     "of matrix products: avx512 or avx2 (arithmetic fused), portable (plain); auto: the best there is"},
     {"train eval import sweep check", "--precision", "NAME", "fp32",
      "of matrix products: fp32, or bf16, whose sums stay fp32 (avx512, on request portable)"},
     {"train eval collect bench check", "--threads", "N", "0",
@@ -279,15 +279,6 @@ inline const Kernel& kernel_for(const std::string& arithmetic) {
     for (const Kernel* kernel : kernels)
         if (kernel->supported() && arithmetic == kernel->arithmetic) return *kernel;
     fail("usage.kernel", "this machine has no kernel of arithmetic %s", arithmetic.c_str());
-}
-
-// `text` as one word of a shell command: between single quotes where a character could mean something to a shell.
-inline std::string shell_word(const std::string& text) {
-    const auto plain = [](unsigned char c) { return std::isalnum(c) || std::strchr("_-+=.,:/@%", c); };
-    if (!text.empty() && std::all_of(text.begin(), text.end(), plain)) return text;
-    std::string word = "'";
-    for (const char c : text) word += c == '\'' ? std::string("'\\''") : std::string(1, c);
-    return word + "'";
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

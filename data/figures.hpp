@@ -1,7 +1,7 @@
 // figures.hpp: charts and maps of cells as SVG text, and pages of sentences, tables and figures as HTML and Markdown.
 //
 //   +---------------------------------------+   A chart is 720 units wide and set in type of 13 and more, so that it
-//   | title                                 |   can be read at half that width. Colours: Okabe and Ito's, distinct to
+//   | title, subtitle                       |   can be read at half that width. Colours: Okabe and Ito's, distinct to
 //   | y |  grid, bands and lines, or bars   |   colour-blind eyes. The background is painted, so that figures read on
 //   |   +---------------------------------  |   dark pages too. The legend has its own rows below the plot: it never
 //   |      x ticks, x label, legend rows    |   covers data.
@@ -126,9 +126,11 @@ struct Key {
     std::string mark, label;
 };
 
-// The title, the marks, and the legend in as many rows as it needs, the first at height `y`, on a white ground.
-inline std::string picture(double w, double y, const std::string& title, std::string marks,
+// The title with a smaller line below it, the marks, and the legend in as many rows as it needs, the first at height
+// `y`, on a white ground, which is wider than `w` where the titles are.
+inline std::string picture(double w, double y, const std::string& title, const std::string& subtitle, std::string marks,
                            const std::vector<Key>& keys) {
+    w = std::max({w, 32 + text_width(title) * 17 / 13, 32 + text_width(subtitle) * 12 / 13});
     double x = 16;
     for (const Key& key : keys) {
         const double needed = 34 + text_width(key.label);
@@ -142,10 +144,11 @@ inline std::string picture(double w, double y, const std::string& title, std::st
     const double h = y + 22;
     return element("svg", {{"width", w}, {"height", h}},
                    "xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 " + point(w, h) +
-                       "\" role=\"img\" aria-label=\"" + escaped(title) +
+                       "\" role=\"img\" aria-label=\"" + escaped(title + (subtitle.empty() ? "" : "; " + subtitle)) +
                        "\" font-family=\"sans-serif\" font-size=\"13\" " + fill(ink),
                    "\n" + rectangle(0, 0, w, h, fill(white)) +
-                       text(16, 30, title, "font-size=\"17\" font-weight=\"bold\"") + marks);
+                       text(16, 22, title, "font-size=\"17\" font-weight=\"bold\"") +
+                       (subtitle.empty() ? "" : text(16, 39, subtitle, "font-size=\"12\"")) + marks);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -204,28 +207,35 @@ struct Chart {
     std::vector<std::string> categories = {};  // of the bars; empty: a chart of lines
     std::vector<Series> series = {};
     std::vector<Mark> marks = {};
+    double low = -INFINITY, high = INFINITY;  // of the quantity: no band or stroke goes beyond
+    std::string subtitle = {};
 
     bool bars() const { return !categories.empty(); }
     size_t points() const { return bars() ? categories.size() : x.size(); }
 };
 
-// The deviation of point i, or 0 if there is none.
-inline double deviation_at(const Series& s, size_t i) { return drawable(s.deviation[i]) ? s.deviation[i] : 0; }
+// The ends of the band or stroke at point i: one deviation from its mean, or none, as far as the quantity goes.
+struct Ends {
+    double low, high;
+};
+inline Ends ends_at(const Chart& chart, const Series& s, size_t i) {
+    const double mean = s.mean[i], deviation = drawable(s.deviation[i]) ? s.deviation[i] : 0;
+    return {std::min(mean, std::max(mean - deviation, chart.low)),
+            std::max(mean, std::min(mean + deviation, chart.high))};
+}
 
-// The axis covers the points with their bands or error bars, and the marks; of bars the zero too. Bands of numbers that
-// are not negative are cut at zero.
+// The axis covers the points with their bands or strokes, and the marks; of bars the zero too.
 inline Axis y_axis(const Chart& chart) {
-    double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY, least = INFINITY;
-    const auto include = [&](double mean, double deviation) {
-        if (!drawable(mean)) return;
-        low = std::min(low, mean - deviation);
-        high = std::max(high, mean + deviation);
-        least = std::min(least, mean);
+    double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY;
+    const auto include = [&](const Ends& ends) {
+        low = std::min(low, ends.low);
+        high = std::max(high, ends.high);
     };
     for (const Series& s : chart.series)
-        for (size_t i = 0; i < s.mean.size(); ++i) include(s.mean[i], deviation_at(s, i));
-    for (const Mark& mark : chart.marks) include(mark.value, 0);
-    if (least >= 0) low = std::max(low, 0.0);
+        for (size_t i = 0; i < s.mean.size(); ++i)
+            if (drawable(s.mean[i])) include(ends_at(chart, s, i));
+    for (const Mark& mark : chart.marks)
+        if (drawable(mark.value)) include({mark.value, mark.value});
     return linear_axis(low, high, 5, plot_bottom, plot_top);
 }
 
@@ -268,10 +278,11 @@ inline void draw_line(const Series& s, const Chart& chart, const Axis& x, const 
     std::string middle, upper, lower;  // of the piece so far
     for (size_t i = 0; i < chart.points(); ++i) {
         if (!drawable(s.mean[i])) continue;
-        const double px = x.at(chart.x[i]), deviation = deviation_at(s, i);
+        const double px = x.at(chart.x[i]);
+        const Ends ends = ends_at(chart, s, i);
         middle += point(px, y.at(s.mean[i]));
-        upper += point(px, y.at(s.mean[i] + deviation));
-        lower = point(px, y.at(s.mean[i] - deviation)) + lower;
+        upper += point(px, y.at(ends.high));
+        lower = point(px, y.at(ends.low)) + lower;
         if (i + 1 < chart.points() && drawable(s.mean[i + 1])) continue;
         bands += path(upper + lower + "Z", fill(s.colour) + " fill-opacity=\"0.18\"");
         lines += path(middle, line_style(s)) + circle(px, y.at(s.mean[i]), 3, fill(s.colour));
@@ -289,9 +300,9 @@ inline std::string draw_bars(size_t k, const Chart& chart, const Axis& x, const 
         const double start = static_cast<double>(i) - 0.4 + share * static_cast<double>(k);
         const double left = x.at(start), w = x.at(start + 0.92 * share) - left, top = y.at(s.mean[i]);
         out += rectangle(left, top, w, y.at(0) - top, fill(s.colour));
-        const double deviation = deviation_at(s, i), middle = left + w / 2;
-        if (deviation > 0)
-            out += line(middle, y.at(s.mean[i] + deviation), middle, y.at(s.mean[i] - deviation), stroke(ink, 1.5));
+        const Ends ends = ends_at(chart, s, i);
+        const double middle = left + w / 2;
+        if (ends.high > ends.low) out += line(middle, y.at(ends.high), middle, y.at(ends.low), stroke(ink, 1.5));
     }
     return out;
 }
@@ -330,7 +341,8 @@ inline std::string draw_chart(const Chart& chart) {
         column += 11;
         keys.push_back({diamond(13, 0, mark.colour), mark.label});
     }
-    return picture(width, plot_bottom + 72, chart.title, draw_axes(chart, x, y) + bands + data + dashed_lines, keys);
+    return picture(width, plot_bottom + 72, chart.title, chart.subtitle,
+                   draw_axes(chart, x, y) + bands + data + dashed_lines, keys);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -377,6 +389,7 @@ struct CellMap {
     int rows, columns;
     std::string filled = {}, marks = {}, paths = {}, ends = {};
     std::vector<Key> keys = {};  // of the legend
+    std::string subtitle = {};
 
     static constexpr double left = 48, top = 76;
     double size() const { return std::min(600.0 / columns, 480.0 / rows); }  // of a cell
@@ -421,7 +434,8 @@ inline std::string draw_map(const CellMap& map) {
         cells += line(edge, map.top, edge, bottom, stroke("#B0B0B0", 1));
         if (column < map.columns) cells += text(map.x(column), map.top - 9, std::to_string(column), centred);
     }
-    return picture(right + 24, bottom + 28, map.title, cells + map.marks + map.paths + map.ends, map.keys);
+    return picture(right + 24, bottom + 28, map.title, map.subtitle, cells + map.marks + map.paths + map.ends,
+                   map.keys);
 }
 
 }  // namespace svg

@@ -2,10 +2,12 @@
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
 // length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
 //
-// Reads what run_folder.hpp writes: settings, progress.csv, episodes.csv (without the file `finished` these logs may be
-// missing or incomplete); of mazes paths.csv, if it is there; of finished grid worlds policy.csv and start_actions.csv.
-// Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; seeds are
-// averaged only if nothing but the seed was set differently, and the physics were the same; errors name file and line.
+// Reads what run_folder.hpp writes: settings, command (older folders have none), progress.csv, episodes.csv (without the
+// file `finished` these logs may be missing or incomplete); of mazes paths.csv, if it is there; of finished grid worlds
+// policy.csv and start_actions.csv.
+// Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; runs are
+// averaged only if all their settings but the seed are equal, those of the data and the first weights included, and
+// other runs stand in rows of their own, whose labels name what differs; errors name file and line.
 // Leaves out: networks, statistics beyond mean and standard deviation, judging whether a difference matters.
 // Order: logs; one run folder; numbers; the paper's results; figures; tables; sections; the report.
 #pragma once
@@ -13,6 +15,8 @@
 #include <array>
 #include <filesystem>
 #include <map>
+#include <ranges>
+#include <set>
 #include <tuple>
 
 #include "../gridworld.hpp"
@@ -119,9 +123,13 @@ struct MazeEpisode {
     std::vector<svg::Place> places;  // of each state, on the map or outside of it
 };
 
+// The settings that decide what a run computes, in the order of their table.
+using Identity = std::vector<std::variant<bool, int64_t, double, std::string>>;
+
 struct Run {
-    std::string folder;
+    std::string folder, command;
     Settings settings;
+    Identity identity;
     size_t method = 0;                   // in `methods`
     const MujocoTask* mujoco = nullptr;  // null: the grid world
     bool finished = false;
@@ -134,9 +142,8 @@ struct Run {
 
     const Method& about_method() const { return methods[method]; }
     bool offline_only() const { return method == 0; }
-    std::string name() const { return about_method().label + (" seed " + std::to_string(settings.seed)); }
 };
-using Runs = std::vector<const Run*>;              // of one method unless said otherwise, by seed; never empty
+using Runs = std::vector<const Run*>;              // of one row unless said otherwise, by seed; never empty
 using Quantity = std::vector<double> Run::*;       // length, total or score
 using Summary = double (*)(const Run&, Quantity);  // final_value or last_ten
 
@@ -189,6 +196,18 @@ inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& lo
     return out;
 }
 
+// A row averages over seeds. A data set is known by its checksum, whatever its file is called.
+inline bool identifies(const SettingRow& row) {
+    return row.field != Field(&Settings::seed) && row.field != Field(&Settings::dataset);
+}
+
+inline Identity identity_of(const Settings& settings) {
+    Identity out;
+    for (const SettingRow& row : setting_rows)
+        if (identifies(row)) std::visit([&](auto field) { out.emplace_back(settings.*field); }, row.field);
+    return out;
+}
+
 // All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
 inline Run read_run(const std::string& folder) {
     const auto file = [&](const char* name) { return folder + "/" + name; };
@@ -199,6 +218,8 @@ inline Run read_run(const std::string& folder) {
     Run run;
     run.folder = folder;
     run.settings = settings_from_text(read_file(file("settings")), file("settings"));
+    run.command = exists("command") ? split(read_file(file("command")), '\n')[0] : train_command(run.settings);
+    run.identity = identity_of(run.settings);
     while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
     run.mujoco = find_mujoco_task(run.settings.task);
     if (run.mujoco && run.settings.physics == "none")
@@ -256,7 +277,7 @@ inline std::string plus_minus(const Spread& spread) {
 }
 
 // Mean and deviation over runs of each entry of row_of(run), a list that is equally long for all runs.
-inline svg::Series mean_series(const char* label, const char* colour, const Runs& runs, const auto& row_of) {
+inline svg::Series mean_series(const std::string& label, const char* colour, const Runs& runs, const auto& row_of) {
     std::vector<std::vector<double>> rows;
     for (const Run* run : runs) rows.push_back(row_of(*run));
     svg::Series out{label, colour, {}, {}};
@@ -403,31 +424,134 @@ inline const PaperResult* paper_result(const Run& run) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Figures of one group of runs
 
-// Runs of one task, preset and physics.
-struct Group {
-    Runs runs;                  // by method, then by seed
-    std::string heading, file;  // file: the beginning of the figures' names
-    Quantity quantity;          // which is compared with the paper
-    const char* unit;           // its name
-    std::vector<Runs> by_method = {};
+// The colours of ten paths: Okabe and Ito's but black, three of Tol's that stand apart from them, grey. More paths
+// would hide each other. The first three are the methods', and the others those of further rows of a method.
+constexpr std::array<const char*, 10> palette{svg::blue, svg::vermillion, svg::green, svg::purple, "#E69F00",
+                                              svg::sky,  "#332288",       "#882255",  "#999933",   "#777777"};
+
+// Runs that differ in the seed alone.
+struct Row {
+    Runs runs;
+    size_t number;       // among the rows of its method, from 0
+    const char* colour;  // the first row of a method has the method's
+    std::string differences = "";
 
     const Run& any() const { return *runs[0]; }
+    std::string label() const {
+        return any().about_method().label + (differences.empty() ? "" : " (" + differences + ")");
+    }
+    std::string name_of(const Run& run) const { return label() + " seed " + std::to_string(run.settings.seed); }
+    std::string file() const {  // a part of its figures' names
+        return any().settings.method + (number == 0 ? "" : "-" + std::to_string(number + 1));
+    }
 };
+
+// Runs of one task, preset and physics.
+struct Group {
+    Runs runs;                             // by method, then by the other settings, then by seed
+    std::string task, conditions, file;    // conditions: preset and physics; file: the beginning of the figures' names
+    Quantity quantity;                     // which is compared with the paper
+    const char* unit;                      // its name
+    std::vector<Row> rows = {};            // in the order of the runs
+    std::vector<std::string> in_all = {};  // what all runs have in another way than the preset
+
+    const Run& any() const { return *runs[0]; }
+    std::string heading() const { return task + ", " + conditions; }
+};
+
+// The rows of a group's runs. Errors: report.same_seed.
+inline std::vector<Row> rows_of(const Runs& runs) {
+    std::vector<Row> rows;
+    size_t further = 0;  // rows that are not the first of their method
+    for (const Run* run : runs) {
+        if (rows.empty() || rows.back().any().identity != run->identity) {
+            const bool first = rows.empty() || rows.back().any().method != run->method;
+            const char* const colour = first ? run->about_method().colour
+                                             : palette[methods.size() + further++ % (palette.size() - methods.size())];
+            rows.push_back({{}, first ? 0 : rows.back().number + 1, colour});
+        } else if (rows.back().runs.back()->settings.seed == run->settings.seed) {
+            fail("report.same_seed", "%s and %s have the same settings and the same seed; give only one of them",
+                 rows.back().runs.back()->folder.c_str(), run->folder.c_str());
+        }
+        rows.back().runs.push_back(run);
+    }
+    return rows;
+}
+
+// A setting and its value for readers: of checksums the first digits, of the data set also the file's name.
+inline std::string shown_setting(const Settings& settings, const SettingRow& row) {
+    constexpr size_t digits = 8;
+    if (row.field == Field(&Settings::dataset_sha256))
+        return "dataset=" + settings.dataset +
+               (settings.dataset == "none" ? "" : " (SHA-256 " + settings.dataset_sha256.substr(0, digits) + ")");
+    const std::string value = setting_text(settings, row);
+    return std::string(row.name) + "=" +
+           (row.field == Field(&Settings::first_weights) ? value.substr(0, digits) : value);
+}
+
+// Compares each setting with what task, method and preset make it. A difference that all rows share goes to `in_all`.
+// Any other goes into the labels of all rows of the methods that it occurs in, those without it included, so that no
+// value is left to guess. What sets methods apart by their presets is not named.
+inline void name_differences(Group& group) {
+    for (const SettingRow& setting : setting_rows) {
+        if (!identifies(setting)) continue;
+        std::set<std::string> departures;  // of the rows; "": none
+        std::set<size_t> methods_that_depart;
+        for (const Row& row : group.rows) {
+            const Settings& settings = row.any().settings;
+            const Settings usual = default_settings(settings.task, settings.method, settings.preset);
+            const bool departs = setting_text(settings, setting) != setting_text(usual, setting);
+            departures.insert(departs ? shown_setting(settings, setting) : "");
+            if (departs) methods_that_depart.insert(row.any().method);
+        }
+        if (departures.size() == 1) {
+            if (!departures.begin()->empty()) group.in_all.push_back(*departures.begin());
+            continue;
+        }
+        for (Row& row : group.rows)
+            if (methods_that_depart.contains(row.any().method))
+                row.differences += (row.differences.empty() ? "" : ", ") + shown_setting(row.any().settings, setting);
+    }
+}
+
+// What stands below a figure's title: the conditions, how many seeds its rows have, and what `spread` shows of them.
+inline std::string subtitle(const Group& group, const std::vector<Row>& rows, const std::string& spread) {
+    const auto [least, most] = std::ranges::minmax(rows, {}, [](const Row& row) { return row.runs.size(); });
+    const size_t low = least.runs.size(), high = most.runs.size();
+    if (high == 1) return group.conditions + "; n = 1 seed, so no " + spread;
+    return group.conditions + "; mean over n = " + (low < high ? std::to_string(low) + " to " : "") +
+           std::to_string(high) + " seeds; " + spread + ": one standard deviation to either side";
+}
+inline std::string subtitle_of_one(const Group& group, const Row& row) {
+    return group.conditions + "; one run, of n = " + std::to_string(row.runs.size()) +
+           (row.runs.size() > 1 ? " seeds" : " seed");
+}
 
 // Figs. 1b and 4a, and their like for other tasks: means over seeds. The paper's results are marked beside the curves
 // of the quantity that it gives.
 inline Figure curve(const Group& group, Quantity quantity, const std::string& caption) {
     const bool length = quantity == &Run::length;
     const char* label = length ? "evaluation length, steps" : "normalised score";
-    svg::Chart chart{group.any().settings.task + ": " + label, "online interactions", label};
+    svg::Chart chart{group.task + ": " + label, "online interactions", label};
+    chart.subtitle = subtitle(group, group.rows, "band");
     chart.x = curve_points(group.runs);
-    for (const Runs& runs : group.by_method) {
-        const Method& method = runs[0]->about_method();
-        chart.series.push_back(mean_series(method.label, method.colour, runs,
+    const MujocoTask* task = group.any().mujoco;
+    if (length) {
+        const bool torus =
+            std::ranges::any_of(group.runs, [](const Run* run) { return run->settings.edge == "wraps"; });
+        chart.low = task || torus ? 1 : grid_size - 1;  // the goal lies that many diagonal moves from S
+        chart.high = task ? task->max_episode_steps : grid_max_steps;
+    } else if (task && task->maze) {  // a reward is 0 or 1, and antmaze's 1 is the last
+        chart.low = normalised_score(*task, 0);
+        chart.high = normalised_score(*task, task->rules == Rules::antmaze ? 1 : task->max_episode_steps);
+    }
+    for (const Row& row : group.rows) {
+        const Method& method = row.any().about_method();
+        chart.series.push_back(mean_series(row.label(), row.colour, row.runs,
                                            [&](const Run& run) { return resampled(run, quantity, chart.x); }));
-        chart.series.back().dashed = runs[0]->offline_only();
-        const PaperResult* paper = paper_result(*runs[0]);
-        if (paper && quantity == group.quantity && !std::isnan(paper->mean))
+        chart.series.back().dashed = row.any().offline_only();
+        const PaperResult* paper = paper_result(row.any());
+        if (paper && row.number == 0 && quantity == group.quantity && !std::isnan(paper->mean))
             chart.marks.push_back({std::string("paper: ") + method.label, method.colour, paper->mean});
     }
     return {svg::draw_chart(chart), caption, group.file + (length ? "-length.svg" : "-score.svg")};
@@ -435,41 +559,49 @@ inline Figure curve(const Group& group, Quantity quantity, const std::string& ca
 
 // Fig. 1c, of the methods with an online phase.
 inline Figure histogram(const Group& group) {
-    svg::Chart chart{"Lengths of the online episodes", "episode length, steps", "episodes per seed"};
+    svg::Chart chart{group.task + ": lengths of the online episodes", "episode length, steps", "episodes per seed"};
     chart.categories.assign(bar_labels.begin(), bar_labels.end());
-    for (const Runs& runs : group.by_method)
-        if (!runs[0]->offline_only())
-            chart.series.push_back(mean_series(runs[0]->about_method().label, runs[0]->about_method().colour, runs,
-                                               [](const Run& run) { return count_lengths(run.episode_length); }));
+    chart.low = 0;
+    std::vector<Row> rows = group.rows;
+    std::erase_if(rows, [](const Row& row) { return row.any().offline_only(); });
+    chart.subtitle = subtitle(group, rows, "stroke");
+    for (const Row& row : rows)
+        chart.series.push_back(mean_series(row.label(), row.colour, row.runs,
+                                           [](const Run& run) { return count_lengths(run.episode_length); }));
     return {svg::draw_chart(chart),
             "Compare with fig. 1c of the paper. How many of the episodes met in online training had which length; from "
             "11 on a bar covers a range of lengths, and 100 is the time limit.",
             group.file + "-episodes.svg"};
 }
 
-// Figs. 1d, 4b; of finished runs.
-inline Figure start_actions(const Group& group, const Runs& runs) {
-    const Method& method = runs[0]->about_method();
-    svg::Chart chart{std::string("Actions at S: ") + method.label, "move", "share"};
+// Figs. 1d, 4b. `row`: its finished runs.
+inline Figure start_actions(const Group& group, const Row& row) {
+    const Method& method = row.any().about_method();
+    svg::Chart chart{group.task + ": actions at S, " + row.label(), "move", "share"};
+    chart.subtitle = subtitle(group, {row}, "stroke");
+    chart.low = 0;
+    chart.high = 1;
     for (const GridMove& move : grid_move_table) chart.categories.emplace_back(move.name);
     const std::array<std::pair<const char*, const char*>, 3> shown{
         {{"learned policy", method.colour}, {"D_offline", svg::sky}, {"D_online", svg::purple}}};
     for (size_t k = 0; k < shown.size(); ++k)
-        chart.series.push_back(
-            mean_series(shown[k].first, shown[k].second, runs, [&](const Run& run) { return run.start_actions[k]; }));
+        chart.series.push_back(mean_series(shown[k].first, shown[k].second, row.runs,
+                                           [&](const Run& run) { return run.start_actions[k]; }));
     return {svg::draw_chart(chart),
             std::string("Compare with fig. ") + method.start_figure +
                 " of the paper. Finished runs. Share of each move at the start cell S: its probability under the "
                 "learned policy, and its frequency in D_offline and, at the end, in D_online. R, D, L, U: right, down, "
                 "left, up.",
-            group.file + "-start-" + method.name + ".svg"};
+            group.file + "-start-" + row.file() + ".svg"};
 }
 
 // Fig. 1a shows the shortest path in this way; the paper does not show a learned one.
-inline Figure policy_map(const Group& group, const Run& run) {
+inline Figure policy_map(const Group& group, const Row& row) {
+    const Run& run = row.any();
     const char* const path_colour = "#B9DAEF";
     const auto place = [](int cell) { return svg::Place(cell / grid_size, cell % grid_size); };
-    svg::CellMap map{"Learned policy: " + run.name(), grid_size, grid_size};
+    svg::CellMap map{group.task + ": learned policy of " + row.name_of(run), grid_size, grid_size};
+    map.subtitle = subtitle_of_one(group, row);
     const std::vector<int> path = greedy_path(run.policy, make_grid_world(run.settings).edge);
     for (const int cell : path) map.fill_cell(place(cell), path_colour);
     for (int cell = 0; cell < grid_goal; ++cell) {  // no move is made at the goal, which is the last cell
@@ -487,13 +619,8 @@ inline Figure policy_map(const Group& group, const Run& run) {
         "probability p. These moves " +
         std::string(path.back() == grid_goal ? "reach G" : "do not reach G, but return to a visited cell") +
         ". Moves: " + std::to_string(path.size() - 1) + ". Moves off the grid: " + run.settings.edge + ".";
-    return {svg::draw_map(map), caption, group.file + "-grid-" + run.settings.method + ".svg"};
+    return {svg::draw_map(map), caption, group.file + "-grid-" + row.file() + ".svg"};
 }
-
-// The colours of ten paths: Okabe and Ito's but black, three of Tol's that stand apart from them, grey. More paths
-// would hide each other.
-constexpr std::array<const char*, 10> path_colours{"#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
-                                                   "#56B4E9", "#332288", "#882255", "#999933", "#777777"};
 
 // The map of a maze without paths; `map`: rows from the top, each ended by a slash; 1: wall, all else is free.
 inline svg::CellMap maze_cells(const std::string& title, const std::string& map) {
@@ -510,30 +637,31 @@ inline svg::CellMap maze_cells(const std::string& title, const std::string& map)
 }
 
 // The latest evaluation of one run, in a maze. An ant's episodes have goals of their own, maze2d's share one.
-inline Figure maze_map(const Group& group, const Run& run) {
+inline Figure maze_map(const Group& group, const Row& row, const Run& run) {
     const MujocoTask& task = *run.mujoco;
     const bool ant = task.rules == Rules::antmaze;
-    svg::CellMap map = maze_cells(run.settings.task + ": paths of " + run.name(), task.maze);
+    svg::CellMap map = maze_cells(group.task + ": paths of " + row.name_of(run), task.maze);
+    map.subtitle = subtitle_of_one(group, row);
     const double radius = goal_radius / maze_cell_length(task);
     size_t reached = 0;
     for (size_t i = 0; i < run.paths.size(); ++i) {
         const MazeEpisode& episode = run.paths[i];
         reached += episode.reached;
-        if (i >= path_colours.size()) continue;
-        const auto [row, column] = maze_place(task, episode.goal_x, episode.goal_y);
-        if (ant || i == 0) map.add_circle({row, column}, radius, ant ? path_colours[i] : svg::ink);
-        map.add_path(episode.places, path_colours[i]);
+        if (i >= palette.size()) continue;
+        const auto [goal_row, goal_column] = maze_place(task, episode.goal_x, episode.goal_y);
+        if (ant || i == 0) map.add_circle({goal_row, goal_column}, radius, ant ? palette[i] : svg::ink);
+        map.add_path(episode.places, palette[i]);
     }
     const std::string caption =
-        "The latest evaluation of " + run.name() + (run.finished ? "" : ", unfinished") + ": " +
+        "The latest evaluation of " + row.name_of(run) + (run.finished ? "" : ", unfinished") + ": " +
         std::to_string(reached) + " of " + std::to_string(run.paths.size()) +
         " episodes came within 0.5 m of the goal" +
         (ant ? ", which ended them; each has a goal of its own, circled in its colour."
              : " at some time. None ends there: the score counts the steps within that distance.") +
-        (run.paths.size() > path_colours.size() ? " The first 10 are drawn." : "") +
+        (run.paths.size() > palette.size() ? " The first 10 are drawn." : "") +
         " The maze as its map is printed, walls grey; x runs " +
         (ant ? "to the right and y downwards." : "downwards and y to the right.");
-    return {svg::draw_map(map), caption, group.file + "-paths-" + run.settings.method + ".svg"};
+    return {svg::draw_map(map), caption, group.file + "-paths-" + row.file() + ".svg"};
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -544,11 +672,11 @@ inline long unfinished(const Runs& runs) {
 }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
-inline std::string compared(const Runs& runs, Quantity quantity, const PaperResult& paper) {
-    const Spread ours = spread_of(runs, final_value, quantity);
+inline std::string compared(const Row& row, Quantity quantity, const PaperResult& paper) {
+    const Spread ours = spread_of(row.runs, final_value, quantity);
     const double difference = ours.mean - paper.mean;
-    std::string out = runs[0]->about_method().label;
-    if (unfinished(runs) > 0) out += " (unfinished)";
+    std::string out = row.label();
+    if (unfinished(row.runs) > 0) out += " (unfinished)";
     if (ours.count == 0) out += " has no result yet";
     if (ours.count == 1) out += " " + svg::grouped(ours.mean, 2);
     if (ours.count > 1) out += " " + plus_minus(ours);
@@ -559,42 +687,41 @@ inline std::string compared(const Runs& runs, Quantity quantity, const PaperResu
     return out;
 }
 
-// Compares each method with the paper in one sentence, WODTEM first; "" where the paper has no result. The sentence
+// Compares each row with the paper in one sentence, WODTEM first; "" where the paper has no result. The sentence
 // ends with what else differs from the paper's experiment: the number of interactions, and the data set.
 inline std::string verdict(const Group& group) {
     const Run& any = group.any();
     if (!paper_result(any)) return "";
-    std::string out = group.heading + ", final " + group.unit + ": ";
-    for (size_t i = group.by_method.size(); i-- > 0;) {
-        const Runs& runs = group.by_method[i];
-        out += compared(runs, group.quantity, *paper_result(*runs[0])) + (i > 0 ? "; " : "");
-    }
+    std::string out = group.heading() + ", final " + group.unit + ": ";
+    for (const Row& row : std::views::reverse(group.rows))
+        out += compared(row, group.quantity, *paper_result(row.any())) + (&row == &group.rows[0] ? "" : "; ");
     double interactions = 0;
     for (const Run* run : group.runs) interactions = std::max(interactions, run->so_far);
     if (interactions > 0)
         out += "; online interactions: up to " + svg::grouped(interactions, 0) + ", paper " +
                (any.mujoco ? "200,000" : "20,000");
-    if (any.mujoco && any.settings.source.at("dataset") != "D4RL's published file")
-        out += "; the data set is not D4RL's file";
+    const auto has_other_data = [](const Run* run) {
+        return run->mujoco && run->settings.source.at("dataset") != "D4RL's published file";
+    };
+    if (std::ranges::any_of(group.runs, has_other_data)) out += "; the data set is not D4RL's file";
     return out + ".";
 }
 
-// One row for each method: the number of seeds, our results as mean ± deviation over them, and the paper's.
+// One line for each row: the number of seeds, our results as mean ± deviation over them, and the paper's.
 inline Table method_table(const Group& group) {
     const bool scores = group.quantity != &Run::length;
     Table table{{"Method", "Seeds", std::string("Final ") + group.unit, "Mean of last 10", "Paper", "Final return"},
                 {}};
     if (scores) table.header.push_back("Final length");
-    for (const Runs& runs : group.by_method) {
+    for (const Row& row : group.rows) {
         const auto mean = [&](Summary summary, Quantity quantity) {
-            return plus_minus(spread_of(runs, summary, quantity));
+            return plus_minus(spread_of(row.runs, summary, quantity));
         };
-        std::string seeds = std::to_string(runs.size());
-        if (unfinished(runs) > 0) seeds += " (" + std::to_string(unfinished(runs)) + " unfinished)";
-        const PaperResult* paper = paper_result(*runs[0]);
-        table.rows.push_back({runs[0]->about_method().label, seeds, mean(final_value, group.quantity),
-                              mean(last_ten, group.quantity), paper ? paper->text() : "-",
-                              mean(final_value, &Run::total)});
+        std::string seeds = std::to_string(row.runs.size());
+        if (unfinished(row.runs) > 0) seeds += " (" + std::to_string(unfinished(row.runs)) + " unfinished)";
+        const PaperResult* paper = paper_result(row.any());
+        table.rows.push_back({row.label(), seeds, mean(final_value, group.quantity), mean(last_ten, group.quantity),
+                              paper ? paper->text() : "-", mean(final_value, &Run::total)});
         if (scores) table.rows.back().push_back(mean(final_value, &Run::length));
     }
     return table;
@@ -606,38 +733,23 @@ inline Table run_table(const Group& group) {
     Table table{{"Run", "State", "Interactions", std::string("Final ") + group.unit, "Last 10"}, {}};
     if (grid) table.header.insert(table.header.end(), {"Shortest met", "At 5 from"});
     table.header.push_back("Folder");
-    for (const Run* run : group.runs) {
-        std::vector<std::string>& row = table.rows.emplace_back();
-        row = {run->name(), run->finished ? "finished" : "unfinished", svg::grouped(run->so_far, 0)};
-        for (const Summary summary : {final_value, last_ten})
-            row.push_back(svg::grouped(summary(*run, group.quantity), 2));
-        if (grid) row.insert(row.end(), {svg::grouped(shortest_met(*run), 0), svg::grouped(kept_from(*run, 5), 0)});
-        row.push_back(run->folder);
-    }
+    for (const Row& row : group.rows)
+        for (const Run* run : row.runs) {
+            std::vector<std::string>& line = table.rows.emplace_back();
+            line = {row.name_of(*run), run->finished ? "finished" : "unfinished", svg::grouped(run->so_far, 0)};
+            for (const Summary summary : {final_value, last_ten})
+                line.push_back(svg::grouped(summary(*run, group.quantity), 2));
+            if (grid)
+                line.insert(line.end(), {svg::grouped(shortest_met(*run), 0), svg::grouped(kept_from(*run, 5), 0)});
+            line.push_back(run->folder);
+        }
     return table;
 }
 
-// What the command line set beyond task, method, preset, seed and physics: " --set width=64".
-inline std::string other_options(const Run& run) {
-    const std::array<std::string, 5> named{"task", "method", "preset", "seed", "physics"};
-    std::string out;
-    for (const SettingRow& row : setting_rows)
-        if (run.settings.source.at(row.name) == "command line" &&
-            std::find(named.begin(), named.end(), row.name) == named.end())
-            out += std::string(" --set ") + row.name + "=" + setting_text(run.settings, row);
-    return out;
-}
-
-// One row for each run, with the command that repeats it.
+// One line for each run, with the command that repeats it.
 inline Table command_table(const Group& group) {
-    Table table{{"To repeat these runs", "Arithmetic"}, {}};
-    for (const Run* run : group.runs) {
-        const Settings& s = run->settings;
-        table.rows.push_back({"wodtem train " + s.task + " --method " + s.method + " --preset " + s.preset +
-                                  " --seed " + std::to_string(s.seed) + (run->mujoco ? " --physics " + s.physics : "") +
-                                  other_options(*run),
-                              s.arithmetic});
-    }
+    Table table{{"To repeat these runs, each with an --out of its own", "Arithmetic"}, {}};
+    for (const Run* run : group.runs) table.rows.push_back({run->command, run->settings.arithmetic});
     return table;
 }
 
@@ -651,73 +763,59 @@ inline void add_grid_world(Section& section, const Group& group) {
         "interactions of the first evaluation from which on every one took 5 steps, the length of the shortest path "
         "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps.");
     section.parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
-    if (!group.by_method.back()[0]->offline_only()) section.parts.emplace_back(histogram(group));
+    if (!group.rows.back().any().offline_only()) section.parts.emplace_back(histogram(group));
     std::vector<Figure> maps;
-    for (Runs runs : group.by_method) {
-        std::erase_if(runs, [](const Run* run) { return !run->finished; });
-        if (runs.empty()) continue;
-        if (!runs[0]->offline_only()) section.parts.emplace_back(start_actions(group, runs));
-        maps.push_back(policy_map(group, *runs[0]));
+    for (Row row : group.rows) {
+        std::erase_if(row.runs, [](const Run* run) { return !run->finished; });
+        if (row.runs.empty()) continue;
+        if (!row.any().offline_only()) section.parts.emplace_back(start_actions(group, row));
+        maps.push_back(policy_map(group, row));
     }
     section.parts.insert(section.parts.end(), maps.begin(), maps.end());
 }
 
-// Any other task: what its numbers rest on, curves, and in mazes one run's paths for each method.
+// Any other task: what its numbers rest on, curves, and in mazes one run's paths for each row.
 inline void add_mujoco_task(Section& section, const Group& group) {
     const Settings& settings = group.any().settings;
     const MujocoTask& task = *group.any().mujoco;
     const bool ends_early = task.rules != Rules::maze2d && task.rules != Rules::halfcheetah;
-    section.parts.emplace_back(
-        "All runs: physics " + settings.physics + " on MuJoCo " + settings.mujoco + ", masses and inertias as " +
-        (settings.physics == "d4rl" ? "in MuJoCo up to 2.1.0, which made D4RL's data"
-                                    : "MuJoCo 2.2 computes them from the geometry") +
-        ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
-        svg::grouped(task.score_low, 2) + "), 100 for an expert (" + svg::grouped(task.score_high, 2) + "). " +
-        (task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
-         : ends_early                 ? "An episode ends when the body leaves gym's healthy range, or after "
-                                      : "Every episode takes ") +
-        svg::grouped(task.max_episode_steps, 0) + " steps.");
+    section.parts.emplace_back("Physics " + settings.physics + ": masses and inertias as " +
+                               (settings.physics == "d4rl" ? "in MuJoCo up to 2.1.0, which made D4RL's data"
+                                                           : "MuJoCo 2.2 computes them from the geometry") +
+                               ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
+                               svg::grouped(task.score_low, 2) + "), 100 for an expert (" +
+                               svg::grouped(task.score_high, 2) + "). " +
+                               (task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
+                                : ends_early ? "An episode ends when the body leaves gym's healthy range, or after "
+                                             : "Every episode takes ") +
+                               svg::grouped(task.max_episode_steps, 0) + " steps.");
     section.parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
     if (ends_early)  // else a flat line
         section.parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
-    for (const Runs& runs : group.by_method) {
-        const auto found = std::find_if(runs.begin(), runs.end(), [](const Run* run) { return !run->paths.empty(); });
-        if (found != runs.end()) section.parts.emplace_back(maze_map(group, **found));
+    for (const Row& row : group.rows) {
+        const auto found = std::ranges::find_if(row.runs, [](const Run* run) { return !run->paths.empty(); });
+        if (found != row.runs.end()) section.parts.emplace_back(maze_map(group, row, **found));
     }
 }
 
-// A section has runs on one version of the library, since versions may differ in every digit; a mean over seeds needs
-// each seed once and nothing else different. Errors: report.mixed, report.same_seed.
-inline void check_comparable(const Runs& runs) {
-    for (size_t i = 1; i < runs.size(); ++i) {
-        const Run &a = *runs[i - 1], &b = *runs[i];
-        const auto require_equal = [&](const std::string& in_a, const std::string& in_b) {
-            if (in_a != in_b)
-                fail("report.mixed", "%s was run with \"%s\" and %s with \"%s\"; report them apart", a.folder.c_str(),
-                     trimmed(in_a).c_str(), b.folder.c_str(), trimmed(in_b).c_str());
-        };
-        require_equal("MuJoCo " + a.settings.mujoco, "MuJoCo " + b.settings.mujoco);
-        if (a.method != b.method) continue;
-        require_equal(other_options(a), other_options(b));
-        if (a.settings.seed == b.settings.seed)
-            fail("report.same_seed", "%s and %s are the same method with the same seed; give only one of them",
-                 a.folder.c_str(), b.folder.c_str());
-    }
-}
-
-// The section of runs of one task, preset and physics, which are sorted by method, then by seed.
+// The section of runs of one task, preset and physics, sorted as Group says. Errors: report.same_seed.
 inline Section make_section(const Runs& runs) {
-    check_comparable(runs);
     const Settings& settings = runs.at(0)->settings;
     const bool mujoco = runs[0]->mujoco != nullptr;
-    Group group{runs, settings.task + ", preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
+    Group group{runs,
+                settings.task,
+                "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
                 settings.task + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
-                mujoco ? &Run::score : &Run::length, mujoco ? "normalised score" : "length"};
-    for (const Run* run : runs) {
-        if (group.by_method.empty() || group.by_method.back()[0]->method != run->method) group.by_method.emplace_back();
-        group.by_method.back().push_back(run);
+                mujoco ? &Run::score : &Run::length,
+                mujoco ? "normalised score" : "length",
+                rows_of(runs)};
+    name_differences(group);
+    Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
+    if (!group.in_all.empty()) {
+        Table table{{"Other than the preset, in all of these runs"}, {}};
+        for (const std::string& setting : group.in_all) table.rows.push_back({setting});
+        section.parts.emplace_back(table);
     }
-    Section section{group.heading, {method_table(group), run_table(group)}, verdict(group)};
     (mujoco ? add_mujoco_task : add_grid_world)(section, group);
     section.parts.emplace_back(command_table(group));
     return section;
@@ -728,18 +826,20 @@ inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
     std::map<std::tuple<std::string, std::string, std::string>, Runs> groups;
     for (const Run& run : runs) groups[{run.settings.task, run.settings.preset, run.settings.physics}].push_back(&run);
     const char* const numbers =
-        "One section for each task, preset and physics. All numbers come from the run folders, except those marked as "
-        "the paper's. \"a ± b\": mean and standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last "
-        "evaluation of a run; last 10: mean over its last ten evaluations; an evaluation that came to nothing (nan in "
-        "progress.csv) is passed over. \"Agrees\": our mean lies within the paper's standard deviation of the paper's "
-        "mean (grid world: WODTEM 5, ODT 6.5 to 7.5).";
+        "One section for each task, preset and physics. Runs with equal settings but for the seed are averaged; "
+        "others stand apart, and a label in parentheses names the settings that differ from the preset and from other "
+        "rows. All numbers come from the run folders, except those marked as the paper's. \"a ± b\": mean and "
+        "standard deviation over seeds (n − 1; \"-\": one seed). Final: by the last evaluation of a run; last 10: "
+        "mean over its last ten evaluations; an evaluation that came to nothing (nan in progress.csv) is passed over. "
+        "\"Agrees\": our mean lies within the paper's standard deviation of the paper's mean (grid world: WODTEM 5, "
+        "ODT 6.5 to 7.5).";
     const char* const figures =
-        "Curves: mean over seeds, and a band of one standard deviation to either side; diamonds: the paper's final "
-        "results. Seeds are evaluated at different interactions; each is drawn by its last evaluation until then, and "
-        "at the right end by its final one. DT has no online phase and is a dashed line across. Bars: mean over "
-        "seeds; strokes: one standard deviation to either side. Unfinished runs count as far as they go, so that a "
-        "curve may jump where one of them ends. The file settings in a run's folder has the value of every setting "
-        "and where it came from.";
+        "Curves: mean over seeds, and a band of one standard deviation to either side, cut off where the quantity "
+        "itself ends; diamonds: the paper's final results. Seeds are evaluated at different interactions; each is "
+        "drawn by its last evaluation until then, and at the right end by its final one. DT has no online phase and "
+        "is a dashed line across. Bars: mean over seeds; strokes: as bands. Unfinished runs count as far as they go, "
+        "so that a curve may jump where one of them ends. The file settings in a run's folder has the value of every "
+        "setting and where it came from.";
     std::vector<Section> sections{{"How to read this", {numbers, figures}}};
     for (const auto& group : groups) sections.push_back(make_section(group.second));
     return sections;
@@ -755,7 +855,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     std::vector<Run> runs;
     for (const std::string& folder : folders) runs.push_back(read_run(folder));
     std::stable_sort(runs.begin(), runs.end(), [](const Run& a, const Run& b) {
-        return std::tie(a.method, a.settings.seed) < std::tie(b.method, b.settings.seed);
+        return std::tie(a.method, a.identity, a.settings.seed) < std::tie(b.method, b.identity, b.settings.seed);
     });
     const std::vector<Section> sections = make_sections(runs);
 

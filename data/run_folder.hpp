@@ -1,6 +1,7 @@
 // run_folder.hpp: a run is a folder. What stands in it, and how a run that was interrupted continues:
 //
 //   settings                 the settings, each with its source (settings.hpp); written first
+//   command                  the command that makes this run, with the paths of its data set and first weights
 //   progress.csv             a row for each evaluation        grows
 //   episodes.csv             a row for each online episode    grows
 //   checkpoint.safetensors   the whole state, while the run is unfinished
@@ -237,6 +238,7 @@ inline void claim_folder(const RunFolder& folder, const Settings& settings) {
         require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
     else
         write_file_atomic(path, settings_text(settings));  // a start that failed may have left other settings
+    if (!folder.has("finished")) write_file_atomic(folder.file("command"), train_command(settings) + "\n");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -13,13 +13,17 @@
 #pragma once
 
 #include <algorithm>
+#include <cctype>
 #include <charconv>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
+#include <filesystem>
 #include <map>
 #include <memory>
 #include <optional>
 #include <ranges>
+#include <set>
 #include <span>
 #include <string>
 #include <string_view>
@@ -70,6 +74,15 @@ inline std::optional<double> to_number(const std::string& text) {
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), x);
     if (error != std::errc() || end != text.data() + text.size() || !std::isfinite(x)) return std::nullopt;
     return x;
+}
+
+// `text` as one word of a shell command: between single quotes where a character could mean something to a shell.
+inline std::string shell_word(const std::string& text) {
+    const auto plain = [](unsigned char c) { return std::isalnum(c) || std::strchr("_-+=.,:/@%", c); };
+    if (!text.empty() && std::all_of(text.begin(), text.end(), plain)) return text;
+    std::string word = "'";
+    for (const char c : text) word += c == '\'' ? std::string("'\\''") : std::string(1, c);
+    return word + "'";
 }
 
 // Levenshtein distance: the number of letters to insert, remove or replace.
@@ -446,13 +459,17 @@ inline std::string unquoted(const std::string& text) {
     return value;
 }
 
+inline std::string source_of(const Settings& settings, const SettingRow& row) {
+    const auto source = settings.source.find(row.name);
+    return source == settings.source.end() ? row.source : source->second;
+}
+
 inline std::string settings_text(const Settings& settings) {
     std::string text;
     for (const SettingRow& row : setting_rows) {
-        const auto source = settings.source.find(row.name);
         std::string line = std::string(row.name) + " = " + quoted(setting_text(settings, row));
         line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
-        text += line + "# " + (source == settings.source.end() ? row.source : source->second) + "\n";
+        text += line + "# " + source_of(settings, row) + "\n";
     }
     return text;
 }
@@ -517,6 +534,35 @@ inline void require_same_settings(const Settings& found, const Settings& wanted,
              kernel ? "choose the kernel it was begun with (--kernel)"
                     : "choose another folder with --out, or the same settings");
     }
+}
+
+// The command that makes a run of these settings, but for --out. Settings that were read from a file do not know paths:
+// then the data set's file name and the checksum of the model stand in their places. The fused arithmetic needs no
+// option: its kernels are the default where a machine has them.
+inline std::string train_command(const Settings& settings) {
+    std::string command = "./wodtem train " + settings.task;
+    const auto add = [&](const char* option, const std::string& value) {
+        command += std::string(" ") + option + " " + shell_word(value);
+    };
+    const auto add_path = [&](const char* option, const std::string& path, const std::string& otherwise) {
+        add(option, path.empty() ? otherwise : std::filesystem::absolute(path).string());
+    };
+    add("--method", settings.method);
+    add("--preset", settings.preset);
+    add("--seed", std::to_string(settings.seed));
+    if (settings.task != "gridworld") {
+        add_path("--dataset", settings.dataset_path, settings.dataset == "none" ? "random" : settings.dataset);
+        add("--physics", settings.physics);
+    }
+    if (settings.first_weights != "none")
+        add_path("--weights", settings.weights_path, "model-of-sha256-" + settings.first_weights);
+    if (settings.arithmetic == "plain") add("--kernel", "portable");
+    if (settings.arithmetic == "bf16") add("--precision", "bf16");
+    const std::set<std::string> written{"task", "method", "preset", "seed", "arithmetic", "physics"};
+    for (const SettingRow& row : setting_rows)
+        if (source_of(settings, row) == "command line" && !written.contains(row.name))
+            add("--set", std::string(row.name) + "=" + setting_text(settings, row));
+    return command;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -497,13 +497,16 @@ TEST(line_chart_breaks_at_missing_values) {
 
 TEST(line_chart_ends_with_the_data_and_places_points_by_hand) {
     // The y axis is 0..10 on 350..50; its labels are at most two digits wide, so x = 0 lies at 50 + 26 * 0.61.
-    const svg::Chart chart{"t", "x", "y", {0, 20700}, {}, {{"a", svg::blue, {2, 10}, {3, 0}}}, {{"m", svg::green, 5}}};
+    svg::Chart chart{"t", "x", "y", {0, 20700}, {}, {{"a", svg::blue, {2, 10}, {3, 2}}}, {{"m", svg::green, 5}}, 0, 10};
+    chart.subtitle = "r & s";
     const std::string svg = svg::draw_chart(chart);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, "r &amp; s"), size_t{2});
     CHECK_EQUAL(count(svg, ">20,000<"), size_t{1});
     CHECK_EQUAL(count(svg, ">25,000<"), size_t{0});
     CHECK_EQUAL(count(svg, "d=\"M 65.86 290 680 50 \""), size_t{1});
-    CHECK_EQUAL(count(svg, "d=\"M 65.86 200 680 50 680 50 65.86 350 Z\""), size_t{1});  // the band is cut at zero
-    CHECK_EQUAL(count(svg, "d=\"M 683 200 688 193 693 200 688 207 Z\""), size_t{1});    // the mark beside the plot
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 200 680 50 680 110 65.86 350 Z\""), size_t{1});  // the band ends at 0 and 10
+    CHECK_EQUAL(count(svg, "d=\"M 683 200 688 193 693 200 688 207 Z\""), size_t{1});     // the mark beside the plot
 }
 
 TEST(bar_chart_draws_one_bar_per_number) {
@@ -516,16 +519,23 @@ TEST(bar_chart_draws_one_bar_per_number) {
     CHECK_EQUAL(count(svg, "height=\"262.5\""), size_t{1});
     CHECK_EQUAL(count(svg, "y1=\"80\"") + count(svg, "y2=\"95\""), size_t{2});  // 72 and 68
     for (const char* label : {">R<", ">D<", ">R-D<"}) CHECK_EQUAL(count(svg, label), size_t{1});
+    chart.low = 69;
+    chart.high = 70;
+    const std::string cut = svg::draw_chart(chart);
+    CHECK_EQUAL(count(cut, "y1=\"50\" x2=\"571.09\" y2=\"54.29\""), size_t{1});  // 70 and 69 of 70
     chart.series[0].deviation.pop_back();
     CHECK_FAILS("figure.length", svg::draw_chart(chart));
 }
 
 TEST(legend_begins_a_new_row_before_the_edge) {
     const std::vector<svg::Key> keys(3, {"", "a label"});  // 34 + 13 * 0.61 * 7 = 89.51 wide, and a gap of 18
-    const std::string svg = svg::picture(250, 100, "t", "", keys);
+    const std::string svg = svg::picture(250, 100, "t", "", "", keys);
     CHECK_EQUAL(count(svg, "translate(16 100 )") + count(svg, "translate(123.51 100 )"), size_t{2});
     CHECK_EQUAL(count(svg, "translate(16 124 )"), size_t{1});
     CHECK_EQUAL(count(svg, "viewBox=\"0 0 250 146 \""), size_t{1});
+    // A title makes the figure as wide as it needs: 32 + 17 * 0.61 * 30.
+    CHECK_EQUAL(count(svg::picture(250, 100, std::string(30, 't'), "", "", keys), "viewBox=\"0 0 343.1 122 \""),
+                size_t{1});
 }
 
 TEST(map_draws_one_arrow_per_action_on_filled_cells) {
