@@ -149,36 +149,6 @@ struct Run {
     }
 };
 
-// Refuses counts that the schedule of the phases (below) does not lead to. Errors: checkpoint.entry.
-void check_progress(Run& run) {
-    const Progress& p = run.progress;
-    const Settings& settings = run.agent.settings;
-    const auto count = [](int64_t setting) { return static_cast<uint64_t>(setting); };  // none exceeds 1e9
-    const uint64_t offline = count(settings.offline_updates), each = count(settings.updates_per_iteration);
-    const uint64_t every = count(settings.eval_every), budget = count(settings.online_steps);
-    const bool online = p.online == 1;
-    require_entry(p.online <= (budget > 0 ? 1u : 0u), "progress.online", "names no phase of this run");
-    // An episode begins below the budget and has a step or more.
-    const uint64_t most = online ? budget + count(run.agent.spec.max_episode_steps) - 1 : 0;
-    require_entry(p.interactions <= most, "progress.interactions", "is more than this phase makes");
-    require_entry(p.episodes <= p.interactions, "progress.episodes", "exceeds progress.interactions");
-    // An episode begins when the updates of those before it are made.
-    const uint64_t due = offline + p.episodes * each;
-    require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
-                  "does not fit progress.episodes");
-    require_entry(p.evaluations <= (online ? 1 + p.episodes / every : 0) && (!online || p.evaluations >= 1),
-                  "progress.evaluations", "does not fit progress.episodes");
-    require_entry(p.next_evaluation == p.evaluations * every && p.next_evaluation >= p.episodes,
-                  "progress.next_evaluation", "does not fit progress.evaluations and progress.episodes");
-    require_entry(!std::isinf(p.eval_length), "progress.eval_length", "is infinite");
-    require_entry(!std::isinf(p.eval_return), "progress.eval_return", "is infinite");
-    const auto require_sum = [](const char* name, double sum) { require_finite(name, std::array{sum}); };
-    run.tally.visit(require_sum);
-    require_entry(run.optimizer.updates == p.updates, "model.updates", "is not progress.updates");
-    require_entry(run.agent.temperature.optimizer.updates == (run.agent.constrains_entropy() ? p.updates : 0),
-                  "temperature.updates", "is not progress.updates, or 0 where the entropy is not constrained");
-}
-
 // Names every part of the state once; saving and loading call it with their archive, which writes a field under its
 // name or reads it back. Errors of loading: checkpoint.entry, safetensors.*.
 template <class Archive>
@@ -198,14 +168,7 @@ void visit_state(Archive& archive, Run& run) {
     const size_t state_dim = run.agent.spec.state_dim;  // which loading demands of these two
     archive("normaliser.mean", run.agent.normaliser.mean, state_dim);
     archive("normaliser.deviation", run.agent.normaliser.deviation, state_dim);
-    if (archive.loading) {
-        require_finite("temperature.value.log_temperature", std::array{run.agent.temperature.lambda()});
-        require_finite("normaliser.mean", run.agent.normaliser.mean);
-        require_finite("normaliser.deviation", run.agent.normaliser.deviation);
-        for (const float deviation : run.agent.normaliser.deviation)
-            require_entry(deviation > 0, "normaliser.deviation", "holds a number that is not positive");
-        check_progress(run);
-    }
+    if (archive.loading) check_state(run);
     const int moves = run.agent.spec.discrete_actions;
     if (p.online != 0) visit_replay(archive, run.replay, moves);  // in the offline phase it is the data set
     visit_memory(archive, run.memory, moves);
@@ -807,20 +770,6 @@ void save_grid_results(Run& run, const RunFolder& folder) {
     save_start_actions(folder, probabilities[grid_start], moves_at_start(make_data_set(settings), world), online);
 }
 
-// The positions of an evaluation's episodes in a maze; nothing for other tasks.
-void save_maze_paths([[maybe_unused]] const Run& run, [[maybe_unused]] const RunFolder& folder,
-                     [[maybe_unused]] const Evaluation& evaluation) {
-#ifdef WODTEM_MUJOCO
-    std::vector<std::array<double, 2>> goals;
-    for (const Environment* environment : run.environments.all()) {
-        const auto* body = dynamic_cast<const MujocoEnvironment*>(environment);
-        if (!body || !body->task->maze) return;
-        goals.push_back(body->goal);
-    }
-    save_paths(folder, evaluation.episodes, goals);
-#endif
-}
-
 // What a run does not depend on.
 struct TrainOptions {
     const Kernel& kernel;
@@ -896,7 +845,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     compute.asked_to_stop = options.asked_to_stop;
     Observer observer;
     observer.evaluated = [&](const ProgressRow& row, const Evaluation& evaluation) {
-        save_maze_paths(run, folder, evaluation);
+        save_maze_paths(folder, evaluation.episodes, run.environments.all());
         folder.progress.append(progress_line(row, settings));
     };
     observer.played = [&](const EpisodeRow& row) { folder.episodes.append(episode_line(row, settings)); };

@@ -348,9 +348,18 @@ inline void save_start_actions(const RunFolder& folder, const std::vector<float>
     write_file_atomic(folder.file("start_actions.csv"), text);
 }
 
-// paths.csv: the positions of an evaluation's episodes in a maze, the last state included. goals [episodes].
-inline void save_paths(const RunFolder& folder, const std::vector<Episode>& episodes,
-                       const std::vector<std::array<double, 2>>& goals) {
+// paths.csv: the positions of an evaluation's episodes in a maze, the last state included; nothing for other tasks.
+// environments [episodes]: those that played them.
+inline void save_maze_paths([[maybe_unused]] const RunFolder& folder,
+                            [[maybe_unused]] const std::vector<Episode>& episodes,
+                            [[maybe_unused]] std::span<Environment* const> environments) {
+#ifdef WODTEM_MUJOCO
+    std::vector<std::array<double, 2>> goals;
+    for (const Environment* environment : environments) {
+        const auto* body = dynamic_cast<const MujocoEnvironment*>(environment);
+        if (!body || !body->task->maze) return;
+        goals.push_back(body->goal);
+    }
     std::string text = "episode,step,goal_x,goal_y,x,y\n";
     size_t number = 0;
     for (size_t i = 0; i < episodes.size(); ++i) {
@@ -364,4 +373,5 @@ inline void save_paths(const RunFolder& folder, const std::vector<Episode>& epis
         ++number;
     }
     write_file_atomic(folder.file("paths.csv"), text);
+#endif
 }

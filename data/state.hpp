@@ -148,3 +148,40 @@ void visit_memory(Archive& archive, EpisodicMemory& memory, int moves) {
     require_entry(!has_repetition(keys), "memory.keys", "holds a key twice");
     memory.rebuild_derived();
 }
+
+// Refuses a temperature, a normaliser and counts that no run can have saved. Errors: checkpoint.entry.
+template <class Run>
+void check_state(Run& run) {
+    require_finite("temperature.value.log_temperature", std::array{run.agent.temperature.lambda()});
+    require_finite("normaliser.mean", run.agent.normaliser.mean);
+    require_finite("normaliser.deviation", run.agent.normaliser.deviation);
+    for (const float deviation : run.agent.normaliser.deviation)
+        require_entry(deviation > 0, "normaliser.deviation", "holds a number that is not positive");
+    // Counts follow from the schedule of the phases.
+    const auto& p = run.progress;
+    const auto& settings = run.agent.settings;
+    const auto count = [](int64_t setting) { return static_cast<uint64_t>(setting); };  // none exceeds 1e9
+    const uint64_t offline = count(settings.offline_updates), each = count(settings.updates_per_iteration);
+    const uint64_t every = count(settings.eval_every), budget = count(settings.online_steps);
+    const bool online = p.online == 1;
+    require_entry(p.online <= (budget > 0 ? 1u : 0u), "progress.online", "names no phase of this run");
+    // An episode begins below the budget and has a step or more.
+    const uint64_t most = online ? budget + count(run.agent.spec.max_episode_steps) - 1 : 0;
+    require_entry(p.interactions <= most, "progress.interactions", "is more than this phase makes");
+    require_entry(p.episodes <= p.interactions, "progress.episodes", "exceeds progress.interactions");
+    // An episode begins when the updates of those before it are made.
+    const uint64_t due = offline + p.episodes * each;
+    require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
+                  "does not fit progress.episodes");
+    require_entry(p.evaluations <= (online ? 1 + p.episodes / every : 0) && (!online || p.evaluations >= 1),
+                  "progress.evaluations", "does not fit progress.episodes");
+    require_entry(p.next_evaluation == p.evaluations * every && p.next_evaluation >= p.episodes,
+                  "progress.next_evaluation", "does not fit progress.evaluations and progress.episodes");
+    require_entry(!std::isinf(p.eval_length), "progress.eval_length", "is infinite");
+    require_entry(!std::isinf(p.eval_return), "progress.eval_return", "is infinite");
+    const auto require_sum = [](const char* name, double sum) { require_finite(name, std::array{sum}); };
+    run.tally.visit(require_sum);
+    require_entry(run.optimizer.updates == p.updates, "model.updates", "is not progress.updates");
+    require_entry(run.agent.temperature.optimizer.updates == (run.agent.constrains_entropy() ? p.updates : 0),
+                  "temperature.updates", "is not progress.updates, or 0 where the entropy is not constrained");
+}

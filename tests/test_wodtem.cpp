@@ -430,7 +430,7 @@ TEST(batches_hold_what_the_buffer_holds) {
     double sum = 0;
     size_t step = 0;
     for (uint32_t window = 0; window < 32; ++window) {
-        const Window at = f.run.replay.sample(f.run.agent.random(Stream::batch), 0, window, 4, Draw::by_length);
+        const Window at = f.run.replay.sample(f.run.agent.random(Stream::batch), 0, window, 4, Draw::uniform);
         const Trajectory& trajectory = f.run.replay.trajectories[at.trajectory];
         CHECK_EQUAL(batch.sequences.lengths[window], std::min(4, trajectory.length() - at.start));
         for (int c = 0; c < at.length; ++c, ++step) {
