@@ -610,9 +610,10 @@ inline const Kernel& best_kernel() {
 // ---------------------------------------------------------------------------------------------------------------------
 // Products from tiles: packing and sharing out.
 //
-//     for 256 values of k at a time:           B [256, N] packed in panels of tile_columns     by all threads
-//         for each block of rows of C:         A [192, 256] packed in panels of tile_rows      one thread a block
-//             for each panel of B, of A:       one tile of C                                   the kernel
+//     B [K, N], packed in panels of tile_columns, 256 values of k a step        by all threads
+//     for each block of C:                                                      by one thread
+//         for each step:  its rows of A, [192, 256], packed in panels of tile_rows
+//             for each panel of B, for each panel of A:  one tile of C          by the kernel
 //
 // A tile's sums stay in registers for 256 steps of k; the block of A fits in a core's second cache and is read once for
 // each panel of B, and the panel of B, in the first cache, once for each panel of A.
@@ -1196,7 +1197,10 @@ struct Dropout {
     // factor [n] of the elements [first, first + n). Element e has word e % 4 of counter e / 4.
     template <class T>
     void fill(T* factor, size_t first, size_t n) const {
-        if (probability == 0) return static_cast<void>(std::fill_n(factor, n, T(1)));
+        if (probability == 0) {
+            std::fill_n(factor, n, T(1));
+            return;
+        }
         const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
         constexpr size_t counters = 32;

@@ -893,8 +893,8 @@ void command_train(const Arguments& arguments) {
     for (const PlannedRun& run : runs) updates.push_back(expected_updates(run.settings));
     for (size_t i = 0; i < runs.size(); ++i) {
         announce(runs[i]);
-        TrainOptions options{kernel_of(arguments), thread_count(arguments, runs[i].settings),
-                             static_cast<double>(seconds), runs[i].label};
+        const int threads = arguments["--threads"] == "0" ? default_threads(runs[i].settings) : thread_count(arguments);
+        TrainOptions options{kernel_of(arguments), threads, static_cast<double>(seconds), runs[i].label};
         for (size_t later = i + 1; later < runs.size(); ++later) options.later_updates += updates[later];
         train(runs[i].settings, runs[i].folder, options);
     }
@@ -937,7 +937,7 @@ void command_import(const Arguments& arguments) {
 // allocates, times the number of updates to expect.
 double estimated_seconds(Settings settings, const Kernel& kernel) {
     if (settings.task != "gridworld") settings.behaviour = "random";
-    Compute compute(kernel, processor_count());
+    Compute compute(kernel, default_threads(settings));
     Run run(compute, settings, *make_environment(settings));
     begin_run(run, make_data_set(settings));
     update(run);

@@ -248,19 +248,19 @@ inline int thread_count(const Arguments& arguments) {
     return asked > 0 ? static_cast<int>(asked) : processor_count();
 }
 
-// Threads for a run: where none are named, one if an update takes about a millisecond or less. Threads would then wait
-// for each other more than they compute, and for whole time slices on a busy machine.
-inline int thread_count(const Arguments& arguments, const Settings& settings) {
+// Threads that a run uses where none are named: one if an update takes about a millisecond or less. Threads would then
+// wait for each other more than they compute, and for whole time slices on a busy machine.
+inline int default_threads(const Settings& settings) {
     const double weights = 12.0 * static_cast<double>(settings.layers * settings.width * settings.width);
     const double products = weights * static_cast<double>(settings.batch_size * (3 * settings.context_length - 1));
-    return arguments["--threads"] == "0" && products < 1e7 ? 1 : thread_count(arguments);
+    return products < 1e7 ? 1 : processor_count();
 }
 
 // The kernel of --kernel and --precision. "auto" never chooses the imitation of bf16 in portable code. Errors:
 // usage.kernel names the kernels of this machine.
 inline const Kernel& kernel_of(const Arguments& arguments) {
-    const std::string &name = arguments["--kernel"],
-                      precision = arguments.options.contains("--precision") ? arguments["--precision"] : "fp32";
+    const std::string &name = arguments["--kernel"],  // bench measures both precisions and takes no --precision
+        precision = arguments.options.contains("--precision") ? arguments["--precision"] : "fp32";
     std::string available;
     for (const Kernel* kernel : kernels) {
         if (!kernel->supported()) continue;

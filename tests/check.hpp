@@ -1419,7 +1419,7 @@ void check_sampling(Case& c) {
     const Shape windows = {draws.shape[0]};
     std::vector<int> trajectory, start, length;
     for (size_t i = 0; i < windows[0]; ++i) {
-        if (uniform && (draws.values[2 * i] >= static_cast<int64_t>(count) ||
+        if (uniform && (draws.values[2 * i] >= static_cast<int64_t>(order.size()) ||
                         draws.values[2 * i + 1] >= buffer.trajectories[draws.values[2 * i]].length()))
             fail("check.value", "%s: case %s: draw %zu names no step of the buffer", c.file.path.c_str(),
                  c.name.c_str(), i);

@@ -465,6 +465,23 @@ TEST(settings_and_sizes_of_a_vector_are_held_to_their_ranges) {
         file.add("a/in/query", {1, 1}, std::array{bad});
         CHECK_FAILS("memory.not_finite", check(file));
     }
+    // Of two trajectories the buffer keeps the second, of two steps: place 1 and step 2 are not in it.
+    for (const auto& [place, step] : {std::pair{0, 1}, {1, 0}, {0, 2}}) {
+        TensorFile sampling = hand_made("sampling");
+        sampling.metadata["a.capacity"] = "1";
+        sampling.metadata["a.sampling"] = "uniform";
+        sampling.add("a/in/rewards", {5}, std::array{0.0f, 0.0f, 1.0f, 1.0f, 1.0f});
+        sampling.add("a/in/lengths", {2}, std::array<int32_t, 2>{3, 2});
+        sampling.add("a/out/order", {1}, std::array<int32_t, 1>{1});
+        sampling.add("a/in/draws", {1, 2}, std::array<int32_t, 2>{place, step});
+        sampling.add("a/out/trajectory", {1}, std::array<int32_t, 1>{0});
+        sampling.add("a/out/start", {1}, std::array<int32_t, 1>{1});
+        sampling.add("a/out/length", {1}, std::array<int32_t, 1>{1});
+        if (place == 0 && step == 1)
+            CHECK(check(sampling).holds);
+        else
+            CHECK_FAILS("check.value", check(sampling));
+    }
     TensorFile attention = hand_made("attention");
     for (const char* name : {"a/in/q", "a/in/k", "a/in/v", "a/out/y"})
         attention.add(name, {2, 2}, std::array{0., 0., 0., 0.});
