@@ -163,6 +163,8 @@ void visit_state(Archive& archive, Run& run) {
     archive("progress.eval_length", p.eval_length);
     archive("progress.eval_return", p.eval_return);
     run.tally.visit(archive);
+    run.tally.advice_shift.resize(run.agent.model.config.action_dim);
+    archive("progress.advice_shift", run.tally.advice_shift);
     visit_trained(archive, "model", run.agent.model.parameters, run.optimizer);
     visit_trained(archive, "temperature", run.agent.temperature.log_lambda, run.agent.temperature.optimizer);
     const size_t state_dim = run.agent.spec.state_dim;  // which loading demands of these two
@@ -293,6 +295,10 @@ void count_lookups(Run& run, const Batch& batch) {
     for (size_t i = 0; i < batch.neighbours.size(); ++i) {
         run.memory.count_accesses(batch.neighbours[i]);  // every neighbour counts, whether or not it is followed
         run.tally.unmatched_pairs += batch.neighbours[i].empty();
+        if (batch.weights[i] == 1) continue;
+        const size_t first = i * run.agent.spec.action_dim;
+        add_advice(run.tally, run.agent.spec, batch.coefficients[i] * (1.0 - batch.weights[i]), &batch.actions[first],
+                   &batch.advised_actions[first]);
     }
     run.tally.pairs += static_cast<double>(batch.neighbours.size());
     run.tally.short_pairs += batch.short_pairs;

@@ -371,8 +371,11 @@ inline void require_sound(const Rows& rows, const std::string& path) {
 }
 
 // The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.
-inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task) {
-    const Rows rows = read_data_set(path);
+// use_timeouts: cut where the file says so; else at the time limit, as in a file without timeouts (and at terminals).
+inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task,
+                                             bool use_timeouts = true) {
+    Rows rows = read_data_set(path);
+    if (!use_timeouts) rows.timeouts.clear();
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
     return trajectories;
@@ -388,7 +391,7 @@ inline std::vector<Trajectory> make_data_set(const Settings& settings) {
                                         static_cast<Behaviour>(index_of(behaviour_names, settings.behaviour)), seed,
                                         static_cast<int>(settings.data_trajectories));
     else if (settings.behaviour == "recorded")
-        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task));
+        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings.cut == "flags");
     else
         for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
             if (auto trajectory = random_trajectory(*environment, seed, number))

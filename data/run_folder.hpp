@@ -33,7 +33,8 @@
 
 inline constexpr const char* progress_header =
     "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
-    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,physics\n";
+    "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,"
+    "advice,advice_distance,advice_shift,physics\n";
 inline constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions,physics\n";
 
 // Sums since the latest row of progress.csv.
@@ -43,6 +44,9 @@ struct Tally {
     double matched = 0, evicted = 0;  // states that the table already held; entries that it gave up
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
     double dropped = 0;  // episodes whose simulation broke down
+    // The dose: what eq. (9) changes of eq. (2), as add_advice() sums it over updates.
+    double advice = 0, advice_distance = 0;
+    std::vector<double> advice_shift = {};  // [action_dim], or [discrete_actions]; empty: zeros; not of visit()
 
     void visit(auto& archive) {
         archive("progress.loss", loss);
@@ -58,8 +62,36 @@ struct Tally {
         archive("progress.rollout_return", rollout_return);
         archive("progress.rollouts", rollouts);
         archive("progress.dropped", dropped);
+        archive("progress.advice", advice);
+        archive("progress.advice_distance", advice_distance);
     }
 };
+
+// How far a shift of an action goes: its Euclidean length; of a distribution over moves, the probability that is moved.
+inline double length_of_shift(const std::vector<double>& shift, bool discrete) {
+    double sum = 0;
+    for (const double x : shift) sum += discrete ? std::fabs(x) / 2 : x * x;
+    return discrete ? sum : std::sqrt(sum);
+}
+
+// Adds a step's share of the dose. Eq. (2) fits the policy to a, eq. (9) to w a + (1 - w) a-hat, where a discrete action
+// is a distribution over the moves, all on one. advice: (1 - w) times the step's coefficient in the loss; its sum is
+// the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which moves to and fro
+// cancel, and the length of each step's shift. a, a_hat: [action_dim].
+inline void add_advice(Tally& tally, const EnvironmentSpec& spec, double advice, const float* a, const float* a_hat) {
+    const bool discrete = spec.discrete_actions > 0;
+    std::vector<double> shift(discrete ? spec.discrete_actions : spec.action_dim);
+    if (discrete) {
+        shift[static_cast<size_t>(*a_hat)] += advice;
+        shift[static_cast<size_t>(*a)] -= advice;
+    }
+    for (size_t j = 0; !discrete && j < shift.size(); ++j)
+        shift[j] = advice * (static_cast<double>(a_hat[j]) - static_cast<double>(a[j]));
+    tally.advice += advice;
+    tally.advice_distance += length_of_shift(shift, discrete);
+    tally.advice_shift.resize(shift.size());
+    for (size_t j = 0; j < shift.size(); ++j) tally.advice_shift[j] += shift[j];
+}
 
 struct ProgressRow {
     bool online;
@@ -101,12 +133,16 @@ inline std::string progress_line(const ProgressRow& row, const Settings& setting
         return count > 0 ? static_cast<float>(sum / count) : NAN;
     };
     const bool has_entropy = settings.method != "dt";
+    const double advised_updates = settings.method == "wodtem" ? t.updates : 0;
+    const double shift = length_of_shift(t.advice_shift, settings.task == "gridworld");
     return csv_line(row.online ? "online" : "offline", row.updates, row.interactions, row.episodes, row.learning_rate,
                     mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0),
                     has_entropy ? static_cast<float>(row.lambda) : NAN, mean(t.gradient_norm, t.updates),
                     mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs), row.memory_size, row.eval_length,
                     row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
-                    mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped, physics_text(settings));
+                    mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped,
+                    mean(t.advice, advised_updates), mean(t.advice_distance, advised_updates),
+                    mean(shift, advised_updates), physics_text(settings));
 }
 
 // The command `eval`: means over the episodes without an error, and on the grid world the first episode's moves.

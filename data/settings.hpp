@@ -147,7 +147,7 @@ struct Settings {
     int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
     double g_online = 2, g_eval = 1, reward_scale = 1;
     bool keep_lowest = false;
-    std::string sampling = "uniform";
+    std::string sampling = "uniform", cut = "flags";
 
     double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
     int64_t K = 1, projected_dim = 0, table_size = 36;
@@ -181,7 +181,7 @@ constexpr double many = 1e9;
 inline const SettingRow setting_rows[] = {
     {"task", &Settings::task, 0, 0, task_names, "command line"},
     {"method", &Settings::method, 0, 0, "dt|odt|wodtem", "command line"},
-    {"preset", &Settings::preset, 0, 0, "paper|small", "command line"},
+    {"preset", &Settings::preset, 0, 0, "paper|small|reduced", "command line"},
     {"seed", &Settings::seed, 0, 4294967295, "", "command line"},
     {"arithmetic", &Settings::arithmetic, 0, 0, "fused|plain|bf16",
      "the kernel: multiply-add with one rounding or two, or of numbers rounded to bf16"},
@@ -225,6 +225,8 @@ inline const SettingRow setting_rows[] = {
     {"keep_lowest", &Settings::keep_lowest, 0, 0, "", "ODT's code: drops the lowest-return offline trajectory"},
     {"sampling", &Settings::sampling, 0, 0, "by_length|uniform",
      "chosen: so ODT ends near the paper's 7; DT's and ODT's code: by_length"},
+    {"cut", &Settings::cut, 0, 0, "flags|episodes",
+     "D4RL's and ODT's code; episodes (maze2d): at the time limit alone"},
     // Episodic memory.
     {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
     {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},
@@ -317,6 +319,16 @@ inline const TaskRow small_rows[] = {
     {"maze2d", "", "buffer_size=4000", "preset small: the best 1500 trajectories all leave the goal"},
 };
 
+// Preset reduced: Table II's schedule (updates, updates an episode, buffer, learning rate, returns, interactions) with a
+// network of which 2e5 updates take a quarter of an hour on one core. maze2d's data are cut as its episodes are: under
+// the flags the 1500 best trajectories all leave the goal (data/RESULTS.md).
+inline const TaskRow reduced_rows[] = {
+    {"", "", "layers=1 heads=2 width=64 batch_size=128 dropout=0", "preset reduced"},
+    {"", "", "context_length=1 position=no", "preset reduced: states tell all"},
+    {"", "", "eval_episodes=20 eval_every=30", "preset reduced: evaluations of one network differ widely"},
+    {"maze2d", "", "reward_scale=0.01 cut=episodes", "preset reduced"},
+};
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Reading and changing settings by name.
 
@@ -394,6 +406,9 @@ inline Settings default_settings(const std::string& task, const std::string& met
         set_from(settings, "eta", std::to_string(-mujoco->action_dim), "ODT's code: minus the action dimensions");
     if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (preset == "small") apply(small_rows);
+    if (preset == "reduced" && gridworld)
+        fail("usage.setting", "preset reduced is for MuJoCo's tasks; the grid world has small and paper");
+    if (preset == "reduced") apply(reduced_rows);
     if (method == "dt") {
         set_from(settings, "online_steps", "0", "DT learns offline only");
         for (const char* name : {"layers", "heads", "width", "context_length", "learning_rate", "weight_decay",
@@ -414,6 +429,9 @@ inline void check_together(const Settings& settings) {
     if (batch_size * context_length > 1000000)
         fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
              batch_size, context_length);
+    if (settings.cut == "episodes" && !settings.task.starts_with("maze2d"))
+        fail("usage.setting", "cut=episodes is for maze2d, whose data have no episodes; %s has cut=flags",
+             settings.task.c_str());
     if (online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
     const bool gridworld = settings.task == "gridworld";

@@ -181,6 +181,7 @@ void check_state(Run& run) {
     require_entry(!std::isinf(p.eval_return), "progress.eval_return", "is infinite");
     const auto require_sum = [](const char* name, double sum) { require_finite(name, std::array{sum}); };
     run.tally.visit(require_sum);
+    require_finite("progress.advice_shift", run.tally.advice_shift);
     require_entry(run.optimizer.updates == p.updates, "model.updates", "is not progress.updates");
     require_entry(run.agent.temperature.optimizer.updates == (run.agent.constrains_entropy() ? p.updates : 0),
                   "temperature.updates", "is not progress.updates, or 0 where the entropy is not constrained");
