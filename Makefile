@@ -13,11 +13,13 @@
 #   make clean            remove what was built (runs/ stays)
 
 CXX = g++
-# -O2: wodtem.cpp raises it for what computes and lowers it for data/. No result depends on the level.
+# -O2 with loops in vectors, peeled and unswitched: as fast here as -O3, and compiled sooner; wodtem.cpp lowers it for
+# what does not compute. No result depends on the level.
 # -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
 # -fno-math-errno: a square root is an instruction.
-CXXFLAGS = -std=c++20 -O2 -pthread -ffp-contract=off -fno-math-errno \
+CXXFLAGS = -std=c++20 -O2 -fvect-cost-model=dynamic -fpeel-loops -funswitch-loops -pthread \
+           -ffp-contract=off -fno-math-errno \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
 HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml data/policies/* tests/*.hpp)
 # Asked when it is needed, after `packages`.

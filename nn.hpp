@@ -1,8 +1,17 @@
 // nn.hpp: everything numerical that a decision transformer needs, and nothing about reinforcement learning.
 //
-// In order: errors; random numbers by counter; worker threads; vector code; matrix products: their definition, the
-// kernels for a tile of one, how one is shared out; dot products; tensors and the tape; the operations of the network,
-// each with its backward; the decision transformer (DT, ODT sec. 3); policy heads; optimisers.
+//   Errors         Error, fail
+//   Chance         philox, Random, Stream: numbers by counter
+//   Threads        Threads: a job shared out in numbered tasks
+//   Vector code    vectorised, Vector, lanes_at
+//   Products       View, matmul_plain (the definition); Kernel, compute_tile; matmul (the fast version); dot
+//   Tape           Tensor, Gradient, Tape: differentiation in reverse
+//   Operations     linear, layer_norm, dropout_add, attention_plain (the definition), attention; each with its backward
+//   Parameters     Parameter, initialise
+//   Network        Transformer, token_layout, embed_tokens, transformer_block, forward: DT sec. 3, ODT sec. 3
+//   Policy heads   log_prob, entropy: squashed Gaussian, categorical, deterministic
+//   Optimisers     update_parameters: LAMB, AdamW, Adam
+//
 // Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
 // number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
 // Leaves out: anything that knows what a return, an episode, a file or an option is.
@@ -71,7 +80,7 @@ using Words4 = std::array<uint32_t, 4>;
 // words [Count, 4]: the outputs for `Count` counters that differ in their first word: counter[0], counter[0] + 1, ...
 // The loops over the counters are plain so that the compiler turns them into vectors.
 template <uint32_t Count>
-void philox_words(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
+ALWAYS_INLINE void philox_words(uint32_t* words, const Words4& counter, uint32_t key0, uint32_t key1) {
     uint32_t c[4][Count];
     for (size_t word = 0; word < 4; ++word) std::fill_n(c[word], Count, counter[word]);
     for (uint32_t i = 0; i < Count; ++i) c[0][i] += i;
@@ -117,7 +126,7 @@ struct Random {
 
     // The words of `index` to `index` + Count - 1, one after the other: words [Count, 4].
     template <uint32_t Count>
-    void many_words(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
+    ALWAYS_INLINE void many_words(uint32_t* words, uint64_t step, uint32_t index, uint32_t site) const {
         const Words4 counter = {index, site, static_cast<uint32_t>(step), static_cast<uint32_t>(step >> 32)};
         philox_words<Count>(words, counter, seed, stream);
     }
@@ -136,8 +145,8 @@ struct Random {
     }
 
     // Standard normal by Box and Muller, from words 2 and 3; 24 bits reach 5.8 standard deviations.
-    // logf and cosf of glibc 2.36 give the same bits with FMA instructions and without, measured over all 2^24 values of u
-    // and of the angle; the double functions of libm do not. Another library may differ in the last bit.
+    // logf and cosf of glibc 2.36 give the same bits with FMA instructions and without, measured over all 2^24 values
+    // of u and of the angle; the double functions of libm do not. Another library may differ in the last bit.
     float normal(uint64_t step, uint32_t index, uint32_t site = 0) const {
         const Words4 w = words(step, index, site);
         const float u = (static_cast<float>(w[2] >> 8) + 1.0f) * 0x1p-24f;  // (0, 1]
@@ -173,7 +182,9 @@ class Threads {
     int count() const { return static_cast<int>(workers_.size()) + 1; }
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
-    // f must not throw and must not call run(). `serial`: the calling thread runs all tasks alone.
+    // f must not throw and must not call run(). So it allocates nothing: an exception that leaves it would end the
+    // process in a worker, and in the calling thread leave the workers with a job that is gone. Memory is had before.
+    // `serial`: the calling thread runs all tasks alone.
     // Errors: nn.stopped, as soon as asked_to_stop() says yes; the tasks that no thread has begun are then left out.
     template <class F>
     void run(int tasks, F&& f, bool serial = false) {
@@ -281,7 +292,8 @@ N divide_up(N n, std::type_identity_t<N> by) {
 // order of additions is written out, so all versions give the same bits.
 
 // For functions that stand by themselves: the compiler makes the versions, and chooses when the program starts. (The
-// sanitizers cannot start with it.)
+// sanitizers cannot start with it.) No exception may leave such a function: with GCC 12 it ends the process, whoever
+// would catch it. So these functions allocate nothing either.
 #if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
 #define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
@@ -355,6 +367,7 @@ struct View {
 // every kernel follows it, so an element does not depend on M, N, tile shapes or threads.
 constexpr int sum_block = 256;
 
+// Whether a result replaces what is in its place or is added to it.
 enum class Store { overwrite, accumulate };
 
 // The definition of a product. The fast version below is held to it by tests.
@@ -440,7 +453,16 @@ ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
         for (size_t i = 0; i < sizeof(V) / sizeof(float); ++i) sum[i] = bf16_multiply_add(sum[i], a[i], b[i]);
 }
 
-// TileFunction: `Rows` rows of `Vectors` vectors of `Width` sums, held in registers while k runs, word by word.
+// TileFunction: `Rows` rows of `Vectors` vectors of `Width` sums, held in registers while k runs, word by word. One
+// step of k, with two vectors:
+//
+//              row_of_b[0]   row_of_b[1]      read once from the panel of B
+//     a[0]     sum[0][0]     sum[0][1]        each a[r] is broadcast to all lanes, and
+//     a[1]     sum[1][0]     sum[1][1]        sum[r][v] += a[r] * row_of_b[v]:
+//     ...                                     Rows * Vectors multiply-adds for Rows + Vectors loads
+//
+// 12 x 2 sums fill 24 of AVX-512's 32 registers and 6 x 2 sums 12 of AVX2's 16; the others hold a row of B and one of
+// A.
 template <int Rows, int Vectors, int Width, Multiply How>
 ALWAYS_INLINE void compute_tile(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
     constexpr int columns = Width * Vectors, k_a_word = in_bf16(How) ? 2 : 1;
@@ -655,11 +677,16 @@ struct Compute {
         : kernel(chosen),
           threads(thread_count),
           scratch(static_cast<size_t>(thread_count)) {}
+
+    // Sees to it that room(bytes) of each worker's scratch memory allocates nothing in the tasks to come.
+    void reserve_scratch(size_t bytes) {
+        for (Buffer& buffer : scratch) buffer.room(bytes);
+    }
 };
 
-// While one lives, no weight may change (View::weight): products pack each weight once and use its panels again. As long
-// as no weight changes work can be abandoned without loss, so Compute::asked_to_stop holds then: Threads::run() fails
-// with nn.stopped once it says yes.
+// While one lives, no weight may change (View::weight): products pack each weight once and use its panels again. As
+// long as no weight changes work can be abandoned without loss, so Compute::asked_to_stop holds then: Threads::run()
+// fails with nn.stopped once it says yes.
 struct FrozenWeights {
     Compute& compute;
     explicit FrozenWeights(Compute& c) : compute(c) {
@@ -731,8 +758,9 @@ inline void multiply_block(const Kernel& kernel, Buffer& scratch, View<float> c,
         }
 }
 
-// The fast version of matmul_plain, then the epilogue. Two rounds of tasks: B is packed, in steps of sum_block k; then
-// each task computes a block of C, packing its rows of A on the way. A frozen weight is packed once for many products.
+// The fast version of matmul_plain, c [M, N] = or += a [M, K] b [K, N], then the epilogue. Two rounds of tasks: B is
+// packed, in steps of sum_block k; then each task computes a block of C, packing its rows of A on the way. A frozen
+// weight is packed once for many products.
 inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
                    Store store, Epilogue<float> epilogue = {}) {
     if (M == 0 || N == 0) return;
@@ -776,6 +804,7 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
                            std::min(sum_block, K - step * sum_block), step > 0 ? Store::accumulate : store);
         apply_epilogue(c, epilogue, block);
     };
+    compute.reserve_scratch(kernel.panel_bytes(Compute::block_rows, sum_block));
     compute.threads.run(row_blocks * column_blocks, multiply, serial);
 }
 
@@ -793,8 +822,8 @@ inline void matmul(Compute& compute, View<double> c, View<const double> a, View<
 
 // a . b, of [n] each. The order of additions is part of the definition: lane l of 16 sums the products l, l + 16, ...
 // in order; the lanes are folded in halves (lane l with l + 8, then with l + 4, l + 2, l + 1); the products beyond the
-// last whole 16 are summed in order and added at the end. In a single chain each addition would wait for the one before.
-// Width: how many lanes a vector has.
+// last whole 16 are summed in order and added at the end. In a single chain each addition would wait for the one
+// before. Width: how many lanes a vector has.
 template <int Width = 8, class T>
 ALWAYS_INLINE T dot(const T* a, const T* b, ptrdiff_t n) {
     Vector<T, Width> sum[16 / Width] = {};
@@ -882,7 +911,13 @@ struct Tensor {
 };
 
 // Records each operation's backward step and replays them in reverse. Gradients add up, so a tensor may be used any
-// number of times.
+// number of times. How it is used, once for each part of a batch:
+//
+//     tape.reset();                                    forgets the tensors of the part before
+//     x = tape.constant(...);  y = linear(tape, x, affine);  loss = ...;
+//     tape.backward(loss);                             adds to the gradients of the parameters in `affine`, ...
+//
+// A tensor of the tape lasts until reset(); parameters and their gradients belong to the model and last.
 template <class T>
 struct Tape {
     Compute& compute;
@@ -1055,7 +1090,11 @@ struct Affine {
 
 enum class Activation { none, relu };
 
-// activation(x W + b) of x [n, in], output columns [first, first + count) alone: y [n, count].
+// activation(x W + b) of x [n, in], output columns [first, first + count) alone: y [n, count]. W [in, out] is
+// affine.weight, or its transpose if the layout is out_in.
+//
+// Backward, from dy [n, count], where y = relu(z) first becomes dz = dy where y > 0, else 0:
+//     dx += dz W^T        dW += x^T dz        db += sum of dz over rows
 template <class T>
 Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first, int count,
                  Activation activation = Activation::none) {
@@ -1098,7 +1137,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation
     return linear(tape, x, affine, 0, affine.bias.columns, activation);
 }
 
-// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row; a null list names rows 0, 1, ...
+// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row, of [n, d] each; a null list names rows 0, 1, ...
 // Backward: from's gradient at from_rows[i] += to's gradient at to_rows[i].
 template <class T>
 void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows,
@@ -1187,31 +1226,38 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
 }
 
 // Inverted dropout of the elements of one place in the network: each is multiplied by 0 with probability p, by
-// 1 / (1 - p) else. The factors come from the counter (update, place, element).
+// 1 / (1 - p) else. Which are kept comes from the counter (update, place, element).
 struct Dropout {
     Random random;
     uint64_t step;
     uint32_t site;
     float probability;
 
-    // factor [n] of the elements [first, first + n). Element e has word e % 4 of counter e / 4.
-    template <class T>
-    void fill(T* factor, size_t first, size_t n) const {
+    // kept [n] of the elements [first, first + n): 1, or 0 where one is dropped. Element e has word e % 4 of counter
+    // e / 4.
+    ALWAYS_INLINE void fill(uint8_t* kept, size_t first, size_t n) const {
         if (probability == 0) {
-            std::fill_n(factor, n, T(1));
+            std::fill_n(kept, n, uint8_t{1});
             return;
         }
-        const T keep = T(1) / (T(1) - T(probability));
         const uint32_t threshold = static_cast<uint32_t>(static_cast<double>(probability) * 0x1p32);
         constexpr size_t counters = 32;
         for (size_t i = 0; i < n;) {
             uint32_t words[4 * counters];
             random.many_words<counters>(words, step, static_cast<uint32_t>((first + i) / 4), site);
             const size_t skip = (first + i) % 4, count = std::min(4 * counters - skip, n - i);
-            for (size_t j = 0; j < count; ++j) factor[i + j] = words[skip + j] < threshold ? T(0) : keep;
+            for (size_t j = 0; j < count; ++j) kept[i + j] = words[skip + j] >= threshold;
             i += count;
         }
     }
+};
+
+// The factors of some elements, a byte each: a quarter of the memory traffic of floats.
+template <class T>
+struct DropoutMask {
+    const uint8_t* kept;  // [elements] 1 or 0
+    T scale;              // 1 / (1 - p)
+    ALWAYS_INLINE T factor(ptrdiff_t i) const { return T(kept[i]) * scale; }
 };
 
 // `probability` counts while the tape records; without recording nothing is dropped.
@@ -1221,14 +1267,16 @@ Dropout dropout_at(const Tape<T>& tape, uint32_t site, float probability) {
     return {tape.dropout_random, tape.dropout_step, own_site, tape.recording ? probability : 0.0f};
 }
 
-// The factors of [rows, columns] elements; they last until the tape is reset.
+// The mask of [rows, columns] elements; it lasts until the tape is reset.
 template <class T>
-const T* dropout_factors(Tape<T>& tape, const Dropout& dropout, int rows, ptrdiff_t columns) {
-    T* const factors = tape.template scratch<T>(rows * columns);
+DropoutMask<T> dropout_mask(Tape<T>& tape, const Dropout& dropout, int rows, ptrdiff_t columns) {
+    uint8_t* const kept = tape.template scratch<uint8_t>(rows * columns);
     for_rows(tape.compute, rows, static_cast<int>(8 * columns), [=](int begin, int end, int) {
-        dropout.fill(factors + begin * columns, begin * columns, (end - begin) * columns);
+        vectorised<float>([=](auto) INLINE_LAMBDA {
+            dropout.fill(kept + begin * columns, begin * columns, (end - begin) * columns);
+        });
     });
-    return factors;
+    return {kept, T(1) / (T(1) - T(dropout.probability))};
 }
 
 // dropout(x) + residual, [n, d]; without the sum if the residual is empty.
@@ -1237,13 +1285,15 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
     if (dropout.probability == 0 && !residual.value) return x;
     const Tensor<T> y = tape.make(x.rows, x.columns);
     const ptrdiff_t d = x.columns;
-    const T* const factor = dropout_factors(tape, dropout, x.rows, d);
+    const DropoutMask<T> mask = dropout_mask(tape, dropout, x.rows, d);
     Compute& compute = tape.compute;
     for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
         vectorised<T>([=](auto) INLINE_LAMBDA {
-            for (ptrdiff_t i = begin * d; i < end * d; ++i) y.value[i] = x.value[i] * factor[i];
+            const ptrdiff_t first = begin * d, last = end * d;
             if (residual.value)
-                for (ptrdiff_t i = begin * d; i < end * d; ++i) y.value[i] += residual.value[i];
+                for (ptrdiff_t i = first; i < last; ++i) y.value[i] = x.value[i] * mask.factor(i) + residual.value[i];
+            else
+                for (ptrdiff_t i = first; i < last; ++i) y.value[i] = x.value[i] * mask.factor(i);
         });
     });
     tape.on_backward(y, [=, &compute] {  // dx += dy * factor; d_residual += dy
@@ -1253,7 +1303,7 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
         T *const dx = x.grad(), *const d_residual = residual.gradient ? residual.grad() : nullptr;
         for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
             vectorised<T>([=](auto) INLINE_LAMBDA {
-                for (ptrdiff_t i = begin * d; i < end * d; ++i) dx[i] = (set_x ? T(0) : dx[i]) + dy[i] * factor[i];
+                for (ptrdiff_t i = begin * d; i < end * d; ++i) dx[i] = (set_x ? T(0) : dx[i]) + dy[i] * mask.factor(i);
                 if (d_residual)
                     for (ptrdiff_t i = begin * d; i < end * d; ++i)
                         d_residual[i] = (set_residual ? T(0) : d_residual[i]) + dy[i];
@@ -1334,8 +1384,9 @@ struct Span {
     int first_query, queries;  // its rows of q
 };
 
-// What attention's two passes work on, one (sequence, head) at a time. With queries q_i, keys k_j, values v_j of one
-// head, m_ij its dropout factors and j running over the tokens up to i's:
+// What attention's two passes work on, one (sequence, head) at a time; tasks share nothing that they write, because a
+// span's rows of out, d_q, d_k and d_v belong to one task. With queries q_i, keys k_j, values v_j of one head, m_ij its
+// dropout factors and j running over the tokens up to i's:
 //
 //     s_ij = q_i . k_j / sqrt(size)        w_i = softmax(s_i)        out_i = sum_j m_ij w_ij v_j
 //
@@ -1346,12 +1397,14 @@ struct Span {
 template <class T>
 struct AttentionPass {
     Tensor<T> q, kv, out;
-    const int* position;     // [queries] the token of each query
-    int d, size, heads;      // width of all heads and of one
-    int longest;             // sequence of the batch, in tokens
-    T *weights, *d_weights;  // [queries, heads, longest] after the softmax, before dropout
-    const T* factors;        // [queries, heads, longest] of dropout
-    T scale;                 // 1 / sqrt(size)
+    const int* position;  // [queries] the token of each query
+    int d, size, heads;   // width of all heads and of one
+    int longest;          // sequence of the batch, in tokens
+    // [queries, heads, longest]: w_ij of the forward pass, and room for the backward pass, which turns them into
+    // m_ij w_ij and d_s_ij / sqrt(size).
+    T *weights, *d_weights;
+    DropoutMask<T> mask;  // [queries, heads, longest]
+    T scale;              // 1 / sqrt(size)
 
     // How many tokens query i sees: its own sequence up to and with itself.
     int seen_by(ptrdiff_t i, const Span& span) const { return position[i] - span.first_token + 1; }
@@ -1372,7 +1425,7 @@ struct AttentionPass {
         gather_rows(rows, keys + d, stride, span.tokens, size);  // values
         for (ptrdiff_t i = span.first_query; i < end; ++i) {
             const int seen = seen_by(i, span);
-            for (int j = 0; j < seen; ++j) room[j] = factors[head_at(i, h) + j] * weights[head_at(i, h) + j];
+            for (int j = 0; j < seen; ++j) room[j] = mask.factor(head_at(i, h) + j) * weights[head_at(i, h) + j];
             add_weighted_rows<Width>(out.value + i * d + h * size, room, 1, rows, seen, size, Store::overwrite);
         }
     }
@@ -1385,13 +1438,13 @@ struct AttentionPass {
         for (ptrdiff_t i = first; i < end; ++i) {
             const int seen = seen_by(i, span);
             T *w = weights + head_at(i, h), *dw = d_weights + head_at(i, h);
-            const T* const factor = factors + head_at(i, h);
+            const DropoutMask<T> of_head = {mask.kept + head_at(i, h), mask.scale};
             // dw becomes d_s / sqrt(size), w the weights after dropout: what the sums below need.
             const T* const d_out = out.grad() + i * d + column;
-            for (int j = 0; j < seen; ++j) dw[j] = dot<Width>(d_out, rows + j * size, size) * factor[j];
+            for (int j = 0; j < seen; ++j) dw[j] = dot<Width>(d_out, rows + j * size, size) * of_head.factor(j);
             const T mean = dot<Width>(w, dw, seen);
             for (int j = 0; j < seen; ++j) dw[j] = w[j] * (dw[j] - mean) * scale;
-            for (int j = 0; j < seen; ++j) w[j] *= factor[j];
+            for (int j = 0; j < seen; ++j) w[j] *= of_head.factor(j);
         }
         // d_q_i: a sum over the keys that i sees.
         gather_rows(rows, kv.value + first_key, stride, span.tokens, size);
@@ -1424,9 +1477,10 @@ struct AttentionPass {
 template <class T, class F>
 void for_heads(Compute& compute, const AttentionPass<T>& pass, const Span* spans, int span_count, int work,
                const F& f) {
+    const size_t bytes = static_cast<size_t>(pass.longest) * static_cast<size_t>(pass.size + 1) * sizeof(T);
+    compute.reserve_scratch(bytes);
     for_rows(compute, span_count, work, [&](int begin, int end, int worker) {
-        const size_t floats = static_cast<size_t>(pass.longest) * static_cast<size_t>(pass.size + 1);
-        T* const rows = reinterpret_cast<T*>(compute.scratch[worker].room(floats * sizeof(T)));
+        T* const rows = reinterpret_cast<T*>(compute.scratch[worker].room(bytes));
         vectorised<T>([&](auto lanes) INLINE_LAMBDA {
             for (int s = begin; s < end; ++s)
                 for (int h = 0; h < pass.heads; ++h) f(lanes, spans[s], h, rows, rows + pass.longest * pass.size);
@@ -1449,10 +1503,10 @@ Tensor<T> attention(Tape<T>& tape, Tensor<T> q, Tensor<T> kv, int d, const Span*
     const size_t all = static_cast<size_t>(q.rows * query_size);
     T* const weights = tape.template scratch<T>(all);
     T* const d_weights = tape.recording ? tape.template scratch<T>(all) : nullptr;
-    const T* const factors = dropout_factors(tape, dropout, q.rows, query_size);
+    const DropoutMask<T> mask = dropout_mask(tape, dropout, q.rows, query_size);
     Compute& compute = tape.compute;
-    const AttentionPass<T> pass = {q,     kv,      out,     position,  d,       size,
-                                   heads, longest, weights, d_weights, factors, T(1) / std::sqrt(T(size))};
+    const AttentionPass<T> pass = {q,     kv,      out,     position,  d,    size,
+                                   heads, longest, weights, d_weights, mask, T(1) / std::sqrt(T(size))};
     const int work = static_cast<int>(std::min(1e9, 4.0 * longest * d * std::max(1, q.rows / std::max(1, span_count))));
     for_heads(compute, pass, spans, span_count, work,
               [&](auto lanes, const Span& span, int h, T* rows, T* room)
@@ -1530,6 +1584,10 @@ void initialise(Parameter<T>& parameter, Init init, int fan_in, uint32_t seed, u
 // last action of a window is never a token, and in the last layer only the state tokens whose prediction is wanted (the
 // queries) go on after attention.
 
+// The kinds of policy:
+//   squashed_gaussian   a = tanh(u), u ~ N(mean, exp(log_std)^2) in each dimension     ODT, WODTEM; continuous actions
+//   categorical         a move m with log-probability log_p[m]                         all methods; discrete actions
+//   deterministic       a = tanh(output)                                               DT; continuous actions
 enum class Head { squashed_gaussian, categorical, deterministic };
 
 struct TransformerConfig {
@@ -1560,6 +1618,26 @@ struct Policy {
     Tensor<T> log_std;  // [queries, action_dim] in [-5, 2]; squashed Gaussian only
 };
 
+// The parameters in the order of their construction, d the width, S and A state_dim and action_dim. Each layer has a
+// weight and a bias [out]; biases start at 0, but for the uniform ones.
+//
+//     name                          weight                 start of the weight
+//     embed_return                  [d, 1]                 uniform in +-1/sqrt(fan in), as its bias
+//     embed_state                   [d, S]                 the same
+//     embed_action                  [d, A]                 the same
+//     embed_ln                      [d]                    1
+//     transformer.h.L.ln_1          [d]                    1                                   layer L = 0, 1, ...
+//     transformer.h.L.attn.c_attn   [d, 3 d]               N(0, 0.02^2)
+//     transformer.h.L.attn.c_proj   [d, d]                 N(0, 0.02^2)
+//     transformer.h.L.ln_2          [d]                    1
+//     transformer.h.L.mlp.c_fc      [d, 4 d]               N(0, 0.02^2)
+//     transformer.h.L.mlp.c_proj    [4 d, d]               N(0, 0.02^2)
+//     transformer.ln_f              [d]                    1
+//     predict_action.mu             [A, d]                 orthogonal rows                     squashed Gaussian
+//     predict_action.log_std        [A, d]                 orthogonal rows                     squashed Gaussian
+//     predict_action.logits         [A, d]                 orthogonal rows                     categorical
+//     predict_action.0              [A, d]                 as embed_return                      deterministic
+//     embed_ordering                [max_timesteps, d]     N(0, 1); no bias                    with positions only
 template <class T>
 struct Transformer {
     struct Block {
@@ -1758,7 +1836,8 @@ Tensor<T> elementwise(Tape<T>& tape, Tensor<T> x, F f, Slope slope) {
     return y;
 }
 
-// -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2]. ODT's code.
+// -5 + 3.5 (tanh(x) + 1): the log standard deviation, squashed into [-5, 2], of x [n, A]. Its slope is
+// 3.5 (1 - tanh(x)^2). ODT's code.
 template <class T>
 Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
     const auto value = [](T u) { return T(-5) + T(3.5) * (std::tanh(u) + T(1)); };
@@ -1768,6 +1847,7 @@ Tensor<T> squash_log_std(Tape<T>& tape, Tensor<T> x) {
     });
 }
 
+// tanh(x) of x [n, A], by which the deterministic head keeps actions in (-1, 1); its slope is 1 - tanh(x)^2.
 template <class T>
 Tensor<T> tanh_of(Tape<T>& tape, Tensor<T> x) {
     return elementwise(
@@ -1800,6 +1880,10 @@ Tensor<T> log_softmax(Tape<T>& tape, Tensor<T> logits) {
 }
 
 // pi_theta(. | s_{-C,t}, g_{-C,t}) for every query of the batch, in order of windows and steps.
+//
+//     R, s, a of each step   -> a linear layer each, + the position's row        [tokens, d]
+//     LayerNorm, dropout     -> blocks; in the last one only queries go on       [queries, d]
+//     LayerNorm              -> the head                                         [queries, A]
 template <class T>
 Policy<T> forward(Tape<T>& tape, const Transformer<T>& model, const SequenceBatch& batch, Queries queries) {
     const TransformerConfig& config = model.config;
@@ -1857,6 +1941,7 @@ Tensor<T> row_sums(Tape<T>& tape, std::array<Tensor<T>, 2> inputs, int rows, int
 
 // log pi(a) of a = tanh(u), u ~ N(mean, exp(log_std)^2), summed over the action's dimensions: with u = atanh(a),
 // sum of -((u - mean) / std)^2 / 2 - log_std - log(2 pi) / 2 - log(1 - a^2). actions [n, A], strictly inside (-1, 1).
+// With z = (u - mean) / std the derivatives are z / std by the mean and z^2 - 1 by log_std; u does not depend on them.
 template <class T>
 Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* actions) {
     const Tensor<T> mean = policy.output, log_std = policy.log_std;
@@ -1876,7 +1961,8 @@ Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* action
 }
 
 // One-sample estimate of the entropy, -log pi(tanh(u)) with u = mean + exp(log_std) noise; noise [n, A] standard
-// normal. The gradient flows through the sample, as ODT's does: the Gaussian term is then noise^2 / 2, a constant.
+// normal. The gradient flows through the sample, as ODT's does: the Gaussian term is then noise^2 / 2, a constant. The
+// derivatives are -2 tanh(u) by the mean, and 1 - 2 tanh(u) exp(log_std) noise by log_std.
 template <class T>
 Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) {
     const Tensor<T> mean = policy.output, log_std = policy.log_std;
@@ -1892,7 +1978,8 @@ Tensor<T> gaussian_entropy(Tape<T>& tape, Policy<T> policy, const float* noise) 
     });
 }
 
-// log pi(a): the entry of each row that the action names. actions [n, 1], whole numbers.
+// log pi(a): the entry of each row that the action names. log_p [n, moves]; actions [n, 1], whole numbers below moves.
+// The derivative is 1 by that entry; log_softmax carries it on to the logits.
 template <class T>
 Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* actions) {
     const Tensor<T> a = tape.constant(actions, log_p.rows, 1);
@@ -1902,7 +1989,7 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
         [=](ptrdiff_t row, T dy) { log_p.grad()[named(row)] += dy; });
 }
 
-// H = -sum p log p, exact.
+// H = -sum p log p of each row, exact, in nats. log_p [n, moves]. The derivative by log p is -p (log p + 1).
 template <class T>
 Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
     return row_sums(
@@ -1911,7 +1998,8 @@ Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
         [=](ptrdiff_t i, T dy) { log_p.grad()[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
-// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions. actions [n, A].
+// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions. actions [n,
+// A].
 template <class T>
 Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* actions) {
     const Tensor<T> a = tape.constant(actions, prediction.rows, prediction.columns);
@@ -1939,7 +2027,7 @@ Tensor<T> entropy(Tape<T>& tape, const Policy<T>& policy, const float* noise) {
     return gaussian_entropy(tape, policy, noise);
 }
 
-// sum of coefficient_i x_i, [1, 1], in order, of x [n, 1].
+// sum of coefficient_i x_i, [1, 1], in order, of x [n, 1] and coefficients [n]. Backward: dx_i += coefficient_i dy.
 template <class T, class Number>
 Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
     const Tensor<T> c = tape.constant(coefficients, x.rows, 1);
@@ -1948,7 +2036,7 @@ Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
         [=](ptrdiff_t i, T dy) { x.grad()[i] += c.value[i] * dy; });
 }
 
-// a x + b y, [1, 1].
+// a x + b y, [1, 1], of x and y [1, 1]. Backward: dx += a dz, dy += b dz.
 template <class T>
 Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
     const Tensor<T> z = tape.make(1, 1);
@@ -1978,9 +2066,10 @@ struct OptimizerConfig {
     uint64_t warmup_updates = 10000;
 };
 
+// The state of an optimiser. `updates` is t of the equations after the update, and n of the warm-up before it.
 struct Optimizer {
     uint64_t updates = 0;
-    std::vector<std::vector<float>> first_moment, second_moment;  // one of each per parameter tensor
+    std::vector<std::vector<float>> first_moment, second_moment;  // m and v, one of each per parameter tensor
 };
 
 // Linear warm-up: the factor of update n = 0, 1, ... is min((n + 1) / warmup, 1). ODT's code.
@@ -1992,6 +2081,7 @@ inline double warmup_factor(uint64_t update, uint64_t warmup_updates) {
 // blocks added in order.
 constexpr size_t update_block = 4096;
 
+// The sum of squares of x [n], n <= update_block.
 template <class T>
 double block_of_squares(const T* x, size_t n) {
     double lane[8] = {}, sum = 0;
@@ -2003,7 +2093,8 @@ double block_of_squares(const T* x, size_t n) {
     return sum;
 }
 
-// f(block, first, count) for each block of [0, n), on all threads.
+// f(block, first, count) for each block of [0, n), on all threads: its number, its first element and how many it has.
+// `work`: about how many operations a block.
 template <class F>
 void for_blocks(Compute& compute, size_t n, int work, F&& f) {
     for_rows(compute, static_cast<int>(divide_up(n, update_block)), work, [&](int begin, int end, int) {
@@ -2075,10 +2166,12 @@ double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& paramete
     return std::sqrt(total);
 }
 
-// One update of all parameters from their gradients; returns the gradient's norm before clipping.
-// LAMB as ODT has it: per tensor (Q, K, V are one), step times ||value|| / ||u||, and 1 where either norm is 0; skipped
-// altogether at weight decay 0 unless always_adapt. Errors: nn.not_finite names the tensor, before anything is changed
-// (gradient), or after (value).
+// One update of all parameters from their gradients; returns the gradient's norm before clipping. Gradients are 0 after
+// it. LAMB goes over a tensor twice, because the norm of the whole step decides how far each weight goes: moments and
+// step first, the step written over the gradient, then the weights. AdamW and Adam do both for a block at a time.
+// LAMB as ODT has it: the trust ratio |theta| / |u| of each tensor (Q, K, V are one) has no bound, is 1 where either
+// norm is 0, and is left out at weight decay 0 unless always_adapt. Errors: nn.not_finite names the tensor, before
+// anything is changed (gradient), or after (value).
 inline double update_parameters(Compute& compute, std::vector<Parameter<float>>& parameters, Optimizer& optimizer,
                                 const OptimizerConfig& config) {
     const double norm = gradient_norm(compute, parameters);

@@ -24,13 +24,11 @@
 #include <string>
 #include <vector>
 
-// What computes is compiled for speed (attention and small networks take 1.2 to 1.5 times as long at -O2); files, words
-// and pictures, in which no loop counts, are compiled quickly.
-#pragma GCC optimize("O3")
 #include "gridworld.hpp"
 #include "memory.hpp"
 #include "mujoco_env.hpp"
 #include "nn.hpp"
+// No loop below this line takes time: it is compiled quickly.
 #pragma GCC optimize("O1")
 #include "data/collect.hpp"
 #include "data/command_line.hpp"
@@ -43,7 +41,6 @@
 #include "data/settings.hpp"
 #include "data/state.hpp"
 #include "tests/trace.hpp"
-#pragma GCC optimize("O2")
 
 // ---------------------------------------------------------------------------------------------------------------------
 // State. Everything that changes during a run lies in plain structs, so that a checkpoint can list it. S and A stand
@@ -406,8 +403,8 @@ void prepare_tape(Run& run, uint32_t part) {
 }
 
 // One update on one batch. WODTEM sec. IV-B.3, step 3: "alternately optimizing" eq. (8): a step of theta, then one of
-// lambda, with the entropy of the same pass. Errors: nn.not_finite; nn.stopped, where nothing but gradients, which are no
-// state, has changed.
+// lambda, with the entropy of the same pass. Errors: nn.not_finite; nn.stopped, where nothing but gradients, which are
+// no state, has changed.
 void update(Run& run) {
     Agent& agent = run.agent;
     Tape<float>& tape = run.learning;
@@ -828,22 +825,14 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     const FolderLock lock(path);
     RunFolder folder{path};
     claim_folder(folder, settings);
-    if (folder.has("finished")) {
-        remove_checkpoint(folder);
-        std::printf("%s is finished already\n", path.c_str());
-        return;
-    }
+    if (is_finished_already(folder)) return;
     Compute compute(options.kernel, options.threads);
     std::optional<StopAtOnce> drawing_and_reading(std::in_place);  // which may take long
     if (options.asked_to_stop()) fail("run.stopped", "%s", nothing_to_save.data());
     Run run(compute, settings, *make_environment(settings));
     const bool had_log = folder.has("progress.csv"), resumed = begin_or_continue(run, folder);
     drawing_and_reading.reset();
-    if (resumed)
-        std::fprintf(stderr, "%s: continuing at update %llu\n", path.c_str(),
-                     static_cast<unsigned long long>(run.progress.updates));
-    else if (had_log)
-        std::fprintf(stderr, "%s: no checkpoint, starting anew\n", path.c_str());
+    if (resumed || had_log) print_start(path, resumed, run.progress.updates);
     if (!resumed) folder.begin_logs();
 
     // Each event of the run has its row in a log; rows come before the checkpoint that counts them.
@@ -880,11 +869,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     if (settings.task == "gridworld") save_grid_results(run, folder);
     write_file_atomic(folder.file("finished"), "");
     remove_checkpoint(folder);
-    std::printf("%s: %llu updates, %llu interactions, evaluation length %s, return %s%s\n", path.c_str(),
-                static_cast<unsigned long long>(run.progress.updates),
-                static_cast<unsigned long long>(run.progress.interactions),
-                number_text(run.progress.eval_length).c_str(), number_text(run.progress.eval_return).c_str(),
-                score_text(settings, run.progress.eval_return).c_str());
+    print_end(path, progress_row(run), settings);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -983,7 +968,6 @@ void command_report(const Arguments& arguments) {
 }
 
 // `bench` and `check` measure and judge the functions above, so they are included behind them.
-#pragma GCC optimize("O1")
 #include "tests/bench.hpp"
 #include "tests/check.hpp"
 

@@ -74,10 +74,10 @@ inline double length_of_shift(const std::vector<double>& shift, bool discrete) {
     return discrete ? sum : std::sqrt(sum);
 }
 
-// Adds a step's share of the dose. Eq. (2) fits the policy to a, eq. (9) to w a + (1 - w) a-hat, where a discrete action
-// is a distribution over the moves, all on one. advice: (1 - w) times the step's coefficient in the loss; its sum is
-// the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which moves to and fro
-// cancel, and the length of each step's shift. a, a_hat: [action_dim].
+// Adds a step's share of the dose. Eq. (2) fits the policy to a, eq. (9) to w a + (1 - w) a-hat, where a discrete
+// action is a distribution over the moves, all on one. advice: (1 - w) times the step's coefficient in the loss; its
+// sum is the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which moves to and
+// fro cancel, and the length of each step's shift. a, a_hat: [action_dim].
 inline void add_advice(Tally& tally, const EnvironmentSpec& spec, double advice, const float* a, const float* a_hat) {
     const bool discrete = spec.discrete_actions > 0;
     std::vector<double> shift(discrete ? spec.discrete_actions : spec.action_dim);
@@ -143,6 +143,21 @@ inline std::string progress_line(const ProgressRow& row, const Settings& setting
                     mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped,
                     mean(t.advice, advised_updates), mean(t.advice_distance, advised_updates),
                     mean(shift, advised_updates), physics_text(settings));
+}
+
+// What is said of a run whose folder holds a part of it already, and of a run that is finished.
+inline void print_start(const std::string& path, bool resumed, uint64_t updates) {
+    if (resumed)
+        std::fprintf(stderr, "%s: continuing at update %s\n", path.c_str(), number_text(updates).c_str());
+    else
+        std::fprintf(stderr, "%s: no checkpoint, starting anew\n", path.c_str());
+}
+
+inline void print_end(const std::string& path, const ProgressRow& row, const Settings& settings) {
+    std::printf("%s: %s updates, %s interactions, evaluation length %s, return %s%s\n", path.c_str(),
+                number_text(row.updates).c_str(), number_text(row.interactions).c_str(),
+                number_text(row.eval_length).c_str(), number_text(row.eval_return).c_str(),
+                score_text(settings, row.eval_return).c_str());
 }
 
 // The command `eval`: means over the episodes without an error, and on the grid world the first episode's moves.
@@ -337,6 +352,14 @@ struct CheckpointTimer {
 
 inline void remove_checkpoint(const RunFolder& folder) {
     std::filesystem::remove(folder.file("checkpoint.safetensors"));
+}
+
+// Says so if the run is finished, and removes a checkpoint that a kill has left beside the model.
+inline bool is_finished_already(const RunFolder& folder) {
+    if (!folder.has("finished")) return false;
+    remove_checkpoint(folder);
+    std::printf("%s is finished already\n", folder.path.c_str());
+    return true;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -319,9 +319,9 @@ inline const TaskRow small_rows[] = {
     {"maze2d", "", "buffer_size=4000", "preset small: the best 1500 trajectories all leave the goal"},
 };
 
-// Preset reduced: Table II's schedule (updates, updates an episode, buffer, learning rate, returns, interactions) with a
-// network of which 2e5 updates take a quarter of an hour on one core. maze2d's data are cut as its episodes are: under
-// the flags the 1500 best trajectories all leave the goal (data/RESULTS.md).
+// Preset reduced: Table II's schedule (updates, updates an episode, buffer, learning rate, returns, interactions) with
+// a network of which 2e5 updates take a quarter of an hour on one core. maze2d's data are cut as its episodes are:
+// under the flags the 1500 best trajectories all leave the goal (data/RESULTS.md).
 inline const TaskRow reduced_rows[] = {
     {"", "", "layers=1 heads=2 width=64 batch_size=128 dropout=0", "preset reduced"},
     {"", "", "context_length=1 position=no", "preset reduced: states tell all"},

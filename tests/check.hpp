@@ -442,8 +442,10 @@ void check_rng(Case& c) {
         const Dropout dropout{random, static_cast<uint64_t>(c.whole("update", 0, 0, 0x1p53)),
                               static_cast<uint32_t>(c.whole("place", 0, 0, 0xFFFFFFFF)),
                               static_cast<float>(c.number("probability", {}, 0, 0.99))};
+        Tape<float> tape(c.compute);
+        const DropoutMask<float> mask = dropout_mask(tape, dropout, 1, static_cast<ptrdiff_t>(n));
         std::vector<float> factors(n);
-        dropout.fill(factors.data(), 0, n);
+        for (size_t i = 0; i < n; ++i) factors[i] = mask.factor(static_cast<ptrdiff_t>(i));
         return c.expect("dropout", {n}, factors);
     }
     const auto index = c.whole_in("index", {any}, 0, 0xFFFFFFFF);

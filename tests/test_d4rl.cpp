@@ -200,6 +200,29 @@ TEST(without_timeouts_the_time_limit_ends_a_trajectory_too) {
                 "0 1! | 2 3 4 | 5 6 7");
 }
 
+// With cut=episodes the file's own timeouts do not count: maze2d-umaze is cut every 300 rows, and 100 are left over.
+TEST(cut_by_episodes_maze_data_end_at_the_time_limit_alone) {
+    const MadeFile made_file;
+    std::vector<uint8_t> timeouts(700), terminals(700);
+    timeouts[99] = timeouts[449] = 1;
+    Hdf5Writer out(made_file.path);
+    out.add("observations", {700, 4}, std::vector<float>(2800));
+    out.add("actions", {700, 2}, std::vector<float>(1400));
+    out.add("rewards", {700}, std::vector<float>(700));
+    out.add("terminals", {700}, terminals);
+    out.add("timeouts", {700}, timeouts);
+    out.close();
+    const auto lengths = [&](bool use_timeouts) {
+        std::vector<int> all;
+        for (const Trajectory& trajectory :
+             load_data_set(made_file.path, *find_mujoco_task("maze2d-umaze-v1"), use_timeouts))
+            all.push_back(trajectory.length());
+        return all;
+    };
+    CHECK(lengths(true) == (std::vector<int>{100, 350}));
+    CHECK(lengths(false) == (std::vector<int>{300, 300}));
+}
+
 // Rows 2 and 6 (timeouts) and 7 (the last) are no tuples; 1 does not lead to 3, 4 ends by itself, 5 is the last tuple.
 TEST(antmaze_is_cut_where_tuples_do_not_go_on_and_at_every_terminal) {
     CHECK_EQUAL(

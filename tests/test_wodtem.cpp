@@ -282,6 +282,26 @@ TEST(the_small_preset_has_one_network_and_as_many_updates_for_all_methods) {
     }
 }
 
+// Preset reduced: Table II but for the network and what evaluation and the data's missing episodes call for.
+TEST(the_reduced_preset_keeps_table_twos_schedule) {
+    const std::set<std::string> reduced = {"preset",     "layers",         "heads",        "width",
+                                           "dropout",    "context_length", "batch_size",   "position",
+                                           "eval_every", "eval_episodes",  "reward_scale", "cut"};
+    for (const char* task : {"maze2d-umaze-v1", "maze2d-large-v1", "walker2d-medium-v2"})
+        for (const char* method : {"odt", "wodtem"}) {
+            const Settings paper = default_settings(task, method, "paper"),
+                           s = default_settings(task, method, "reduced");
+            for (const SettingRow& row : setting_rows)
+                if (!reduced.contains(row.name)) CHECK_EQUAL(setting_text(s, row), setting_text(paper, row));
+            CHECK_EQUAL(s.cut, std::string(task).starts_with("maze2d") ? "episodes" : "flags");
+            check_together(s);
+        }
+    CHECK_FAILS("usage.setting", default_settings("gridworld", "odt", "reduced"));
+    Settings hopper = default_settings("hopper-medium-v2", "odt", "small");
+    hopper.cut = "episodes";
+    CHECK_FAILS("usage.setting", check_together(hopper));
+}
+
 TEST(settings_survive_being_written_and_read) {
     Settings s = tiny_settings("wodtem");
     set_setting(s, "epsilon", "0.30000000000000004");
@@ -490,6 +510,32 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
     }
     CHECK_EQUAL(f.run.tally.short_pairs, short_pairs);
     CHECK(short_pairs > 0 && short_pairs < 512);
+    // The dose: a quarter of each pair that falls short goes from its move to the advised one.
+    std::array<double, 8> moved = {};
+    double distance = 0;
+    const double each = 0.25 / static_cast<double>(batch.weights.size());  // windows of one step
+    for (size_t i = 0; i < batch.weights.size(); ++i) {
+        if (batch.weights[i] == 1) continue;
+        moved[static_cast<size_t>(batch.actions[i])] -= each;
+        moved[static_cast<size_t>(batch.advised_actions[i])] += each;
+        distance += batch.actions[i] != batch.advised_actions[i] ? each : 0;
+    }
+    CHECK_CLOSE(f.run.tally.advice, each * short_pairs, 1e-12);
+    CHECK_CLOSE(f.run.tally.advice_distance, distance, 1e-12);
+    for (size_t move = 0; move < 8; ++move) CHECK_CLOSE(f.run.tally.advice_shift[move], moved[move], 1e-12);
+}
+
+// Two steps with opposite advice: each moves its action by 3 and 4 tenths of the advice, together they move nothing.
+TEST(advice_to_and_fro_has_a_distance_and_no_shift) {
+    const EnvironmentSpec spec = {.state_dim = 1, .action_dim = 2, .discrete_actions = 0, .max_episode_steps = 1};
+    Tally tally;
+    const std::array<float, 2> origin = {0.5f, -0.5f}, away = {0.5f + 0.75f, -0.5f + 1.0f};
+    add_advice(tally, spec, 0.25, origin.data(), away.data());
+    CHECK_CLOSE(length_of_shift(tally.advice_shift, false), 0.25 * 1.25, 1e-12);
+    add_advice(tally, spec, 0.25, away.data(), origin.data());
+    CHECK_EQUAL(tally.advice, 0.5);
+    CHECK_CLOSE(tally.advice_distance, 0.5 * 1.25, 1e-12);
+    CHECK_EQUAL(length_of_shift(tally.advice_shift, false), 0.0);
 }
 
 // Dropout off: each part has masks of its own. Sums in another order, hence not the same bits.
@@ -751,8 +797,8 @@ TEST(a_run_stopped_anywhere_saves_the_state_before_and_ends_with_the_same_bytes)
 }
 
 namespace {
-// Sends a signal to a process that trains, when its folder has a file and some time has passed. Returns how many seconds
-// of the processor's time it then took, which do not depend on what else runs there, and its exit status.
+// Sends a signal to a process that trains, when its folder has a file and some time has passed. Returns how many
+// seconds of the processor's time it then took, which do not depend on what else runs there, and its exit status.
 std::pair<double, int> signalled(const Settings& settings, const std::string& folder, const char* file, int signal) {
     const pid_t child = fork();
     if (child == 0) {
@@ -953,7 +999,10 @@ struct Edit {
 constexpr int shorter = -1, longer = -2;
 
 // As a run on the grid world saves it in the online phase, with 8 moves, 20 trajectories at most and 2 state numbers.
-constexpr Edit edits[] = {{"replay.actions", 0, 8},
+constexpr Edit edits[] = {{"progress.advice_shift", 7, NAN},
+                          {"progress.advice_shift", shorter, 0, "safetensors.shape"},
+                          {"progress.advice", 0, INFINITY},
+                          {"replay.actions", 0, 8},
                           {"replay.actions", 5, 1e9},
                           {"replay.actions", 1, -1},
                           {"replay.actions", 1, 3.5},
