@@ -573,6 +573,163 @@ TEST(an_update_in_parts_is_the_update_of_the_whole_batch) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// What changes from one part of a batch, one update, one episode to the next
+
+// Each part of each update drops other elements, a tenth of them, and acting drops none: a dropped element behind the
+// embedding's LayerNorm is exactly 0.
+TEST(each_part_of_each_update_has_a_dropout_mask_of_its_own) {
+    Settings settings = tiny_settings("odt");
+    for (auto [name, value] : {std::pair{"width", "64"}, {"context_length", "3"}, {"batch_size", "500"}})
+        set_setting(settings, name, value);
+    Fixture f(settings);
+    std::vector<std::vector<bool>> masks;
+    const auto watch = [&](const std::string& name, const Tensor<float>& output) {
+        if (name != "embed_ln") return;
+        masks.emplace_back();  // of the first 1000 elements, which each part has
+        for (size_t i = 0; i < 1000; ++i) masks.back().push_back(output.value[i] == 0);
+    };
+    f.run.learning.watch = watch;
+    update(f.run);
+    update(f.run);
+    CHECK_EQUAL(masks.size(), 2 * size_t{parts_of_batch(settings)});
+    for (size_t i = 0; i < masks.size(); ++i) {
+        CHECK_CLOSE(static_cast<double>(std::count(masks[i].begin(), masks[i].end(), true)), 100, 50);
+        for (size_t j = 0; j < i; ++j) {
+            int both = 0;  // independent masks share a hundredth of the elements
+            for (size_t k = 0; k < 1000; ++k) both += masks[i][k] && masks[j][k];
+            CHECK(both < 50);
+        }
+    }
+    masks.clear();
+    f.run.acting.watch = [&](const std::string& name, const Tensor<float>& output) {
+        for (size_t i = 0; name == "embed_ln" && i < output.size(); ++i) CHECK(output.value[i] != 0);
+    };
+    roll_out(f.run, GridWorld{}, Act::sample, 2, 0, 1);
+}
+
+// WODTEM sec. IV-B.3: the table takes in an online episode before the updates that follow it. One short trajectory is
+// the data set, so that the episode comes through cells which the table does not know.
+TEST(an_online_episode_is_remembered_before_the_next_update) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "data_trajectories", "1");
+    set_setting(settings, "table_size", "1000");
+    Fixture f(settings);
+    std::map<std::pair<float, float>, double> best;  // cell -> greatest d
+    const auto take_in = [&](const Trajectory& trajectory) {
+        for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t) {
+            const double d = trajectory.discounted_returns[t];
+            const auto [cell, is_new] = best.insert({{trajectory.states[2 * t], trajectory.states[2 * t + 1]}, d});
+            if (!is_new) cell->second = std::max(cell->second, d);
+        }
+    };
+    for (const Trajectory& trajectory : f.run.replay.trajectories) take_in(trajectory);
+    const size_t known = best.size();
+    CHECK_EQUAL(f.run.memory.size(), known);
+    Observer observer;
+    observer.played = [&](const EpisodeRow& row) { take_in(row.trajectory); };
+    observer.dropped = [](const std::string&) {};
+    interact(f.run, observer);
+    CHECK(best.size() > known);
+    CHECK_EQUAL(f.run.memory.size(), best.size());
+    for (const auto& [cell, d] : best) {
+        const float state[] = {cell.first, cell.second};
+        const Neighbourhoods found = f.run.memory.search(state, 1);
+        CHECK(!found[0].empty());
+        if (!found[0].empty()) CHECK_EQUAL(f.run.memory.e[found[0][0].entry], d);
+    }
+    CHECK_EQUAL(f.run.tally.rollouts, 1.0);
+}
+
+// The row of an evaluation reports the update before it: after n updates of a warm-up of 10 that is n / 10 of the rate.
+TEST(the_logged_learning_rate_is_that_of_the_latest_update) {
+    Fixture f(tiny_settings("odt"));
+    CHECK_CLOSE(progress_row(f.run).learning_rate, 0.001, 1e-12);  // before the first update: that one's
+    for (int updates = 1; updates <= 12; ++updates) {
+        update(f.run);
+        CHECK_CLOSE(progress_row(f.run).learning_rate, 0.01 * std::min(1.0, updates / 10.0), 1e-12);
+    }
+}
+
+namespace {
+// Two numbers of state and of action: the action is added to the state.
+struct Wandering : Environment {
+    std::array<float, 2> state = {};
+    EnvironmentSpec spec() const override { return {2, 2, 0, 30}; }
+    void reset(const Random&, uint64_t, float* first) override {
+        state = {};
+        std::copy_n(state.data(), 2, first);
+    }
+    Step step(const float* action, float* next) override {
+        for (size_t i = 0; i < 2; ++i) next[i] = state[i] += action[i];
+        return {0, false};
+    }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Wandering>(*this); }
+};
+
+double correlation(const std::vector<double>& x, const std::vector<double>& y) {
+    double xx = 0, yy = 0, xy = 0;
+    for (size_t i = 0; i < x.size(); ++i) xx += x[i] * x[i], yy += y[i] * y[i], xy += x[i] * y[i];
+    return xy / std::sqrt(xx * yy);
+}
+}  // namespace
+
+// ODT sec. 3: online actions are tanh(u), u ~ N(mean, exp(log_std)^2) in each dimension by itself. 4,000 of them, taken
+// apart again: standard normals, independent over dimensions, steps and episodes. 0.08 is five standard deviations.
+TEST(exploration_draws_each_dimension_at_each_step_of_each_episode_from_the_policy) {
+    Settings settings = tiny_settings("odt");
+    Compute compute(best_kernel(), 1);
+    const Run run(compute, settings, Wandering{});
+    float mean[] = {0.3f, -0.2f}, log_std[] = {-1.5f, -0.5f};
+    const Policy<float> policy = {Head::squashed_gaussian, {mean, nullptr, 1, 2}, {log_std, nullptr, 1, 2}};
+    const Random random = {test_seed(), Stream::exploration};
+    std::array<std::vector<double>, 4> z;  // two dimensions, then the same of the next step and of the next episode
+    for (uint32_t t = 0; t < 4000; ++t)
+        for (size_t i = 0; i < 2; ++i) {
+            const auto standardised = [&](uint64_t episode, uint32_t step) {
+                const float a = choose_action(run.agent, policy, 0, Act::sample, random, episode, step)[i];
+                return (std::atanh(static_cast<double>(a)) - mean[i]) / std::exp(static_cast<double>(log_std[i]));
+            };
+            z[i].push_back(standardised(0, t));
+            if (i == 0) z[2].push_back(standardised(0, t + 1));
+            if (i == 0) z[3].push_back(standardised(1, t));
+        }
+    for (size_t i = 0; i < 2; ++i) {
+        double sum = 0, squares = 0;
+        for (const double x : z[i]) sum += x, squares += x * x;
+        CHECK_CLOSE(sum / 4000, 0, 0.08);
+        CHECK_CLOSE(squares / 4000, 1, 0.12);
+    }
+    for (size_t other = 1; other < 4; ++other) CHECK_CLOSE(correlation(z[0], z[other]), 0, 0.08);
+    const std::vector<float> greedy = choose_action(run.agent, policy, 0, Act::most_likely, random, 0, 0);
+    for (size_t i = 0; i < 2; ++i) CHECK_CLOSE(greedy[i], std::tanh(mean[i]), 1e-6);
+}
+
+// The noise of H-bar belongs to the step and the update: the parts of a batch have the noise of the whole, no two steps
+// share theirs, and the next update has other noise.
+TEST(entropy_noise_is_drawn_for_each_step_of_each_update) {
+    Settings settings = tiny_settings("odt");
+    Compute compute(best_kernel(), 1);
+    Run run(compute, settings, Wandering{});
+    std::vector<Trajectory> data;
+    for (uint64_t number = 0; number < 3; ++number) {
+        Wandering environment;
+        data.push_back(*random_trajectory(environment, 1, number));
+        relabel(data.back(), 2, 2, settings.gamma);
+    }
+    begin_run(run, data);
+    const std::vector<float> whole = entropy_noise(run, sample_batch(run, 0, 32));
+    std::vector<float> parts = entropy_noise(run, sample_batch(run, 0, 10));
+    const std::vector<float> rest = entropy_noise(run, sample_batch(run, 10, 32));
+    parts.insert(parts.end(), rest.begin(), rest.end());
+    CHECK_EQUAL(whole.size(), size_t{64});
+    CHECK(parts == whole);
+    CHECK_EQUAL(std::set<float>(whole.begin(), whole.end()).size(), whole.size());
+    run.progress.updates += 1;
+    const std::vector<float> next = entropy_noise(run, sample_batch(run, 0, 32));
+    for (size_t i = 0; i < next.size(); ++i) CHECK(next[i] != whole[i]);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
 // Acting
 
 TEST(episodes_side_by_side_are_the_episodes_one_by_one) {
