@@ -9,12 +9,10 @@
 
 inline void print_datasets(const Hdf5File& file) {
     constexpr size_t listed = 40;
-    for (size_t i = 0; i < std::min(listed, file.datasets.size()); ++i) {
-        const Hdf5Dataset& dataset = file.datasets[i];
+    for (const Hdf5Dataset& dataset : file.datasets | std::views::take(listed))
         std::printf("  %-40s %-18s %-12s %zu bytes stored%s%s\n", json_string(dataset.path).c_str(),
                     shape_text(dataset.shape).c_str(), dataset.type.c_str(), dataset.stored,
                     dataset.unsupported.empty() ? "" : "; cannot be read: ", dataset.unsupported.c_str());
-    }
     if (file.datasets.size() > listed) std::printf("  and %zu more\n", file.datasets.size() - listed);
 }
 

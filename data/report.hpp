@@ -245,9 +245,8 @@ inline Spread spread_of(std::vector<double> values) {
     std::erase_if(values, [](double value) { return std::isnan(value); });
     Spread out{values.size(), none, none};
     const auto n = static_cast<double>(values.size());
-    double sum = 0, squares = 0;
-    for (const double value : values) sum += value;
-    if (n > 0) out.mean = sum / n;
+    double squares = 0;
+    if (n > 0) out.mean = std::accumulate(values.begin(), values.end(), 0.0) / n;
     for (const double value : values) squares += (value - out.mean) * (value - out.mean);
     if (n > 1) out.deviation = std::sqrt(squares / (n - 1));
     return out;
@@ -605,13 +604,10 @@ inline Figure policy_map(const Group& group, const Row& row) {
 }
 
 // The map of a maze without paths; `map`: rows from the top, each ended by a slash; 1: wall, all else is free.
-inline svg::CellMap maze_cells(const std::string& title, const std::string& map) {
-    std::vector<std::string> rows = split(map, '/');
-    rows.pop_back();
-    svg::CellMap out{title, static_cast<int>(rows.size()), static_cast<int>(rows.at(0).size())};
-    for (int row = 0; row < out.rows; ++row)
-        for (int column = 0; column < out.columns; ++column)
-            if (rows[row][column] == '1') out.fill_cell(svg::Place(row, column), "#C8C8C8");
+inline svg::CellMap maze_cells(const std::string& title, const char* map) {
+    const std::vector<MazeCell> walls = cells_marked(map, '1');  // which surround the map: the last is its corner
+    svg::CellMap out{title, walls.back().row + 1, walls.back().column + 1};
+    for (const auto& [row, column] : walls) out.fill_cell(svg::Place(row, column), "#C8C8C8");
     out.keys = {{svg::start_mark(13, 0, svg::faint_ink), "start"},
                 {svg::end_mark(13, 0, svg::faint_ink), "end"},
                 {svg::circle(13, 0, 8, svg::stroke(svg::faint_ink, 1.5)), "goal (radius 0.5 m)"}};
@@ -675,9 +671,9 @@ inline std::string verdict(const Group& group) {
     std::string out = group.heading() + ", final " + group.unit + ": ";
     for (const Row& row : std::views::reverse(group.rows))
         out += compared(row, group.quantity, *paper_result(row.any())) + (&row == &group.rows[0] ? "" : "; ");
-    if (const double most = most_interactions(group.runs); most > 0)
+    if (const double far = most_interactions(group.runs); far > 0)
         out +=
-            "; online interactions: up to " + svg::grouped(most, 0) + ", paper " + (any.mujoco ? "200,000" : "20,000");
+            "; online interactions: up to " + svg::grouped(far, 0) + ", paper " + (any.mujoco ? "200,000" : "20,000");
     const auto has_other_data = [](const Run* run) {
         return run->mujoco && run->settings.source.at("dataset") != "D4RL's published file";
     };
@@ -734,25 +730,25 @@ inline Table command_table(const Group& group) {
 // Sections, each of one group
 
 // Tables and figures of the grid world, in the paper's order of figures.
-inline void add_grid_world(Section& section, const Group& group) {
-    section.parts.emplace_back(
+inline void add_grid_world(std::vector<Part>& parts, const Group& group) {
+    parts.emplace_back(
         "Lengths are in steps. Shortest met: the shortest online episode that reached the goal. At 5 from: the online "
         "interactions of the first evaluation from which on every one took 5 steps, the length of the shortest path "
         "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps.");
-    section.parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
-    if (!group.rows.back().any().offline_only()) section.parts.emplace_back(histogram(group));
+    parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
+    if (!group.rows.back().any().offline_only()) parts.emplace_back(histogram(group));
     std::vector<Figure> maps;
     for (Row row : group.rows) {
         std::erase_if(row.runs, [](const Run* run) { return !run->finished; });
         if (row.runs.empty()) continue;
-        if (!row.any().offline_only()) section.parts.emplace_back(start_actions(group, row));
+        if (!row.any().offline_only()) parts.emplace_back(start_actions(group, row));
         maps.push_back(policy_map(group, row));
     }
-    section.parts.insert(section.parts.end(), maps.begin(), maps.end());
+    parts.insert(parts.end(), maps.begin(), maps.end());
 }
 
 // Any other task: what its numbers rest on, curves, and in mazes one run's paths for each row.
-inline void add_mujoco_task(Section& section, const Group& group) {
+inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
     const Settings& settings = group.any().settings;
     const MujocoTask& task = *group.any().mujoco;
     const bool ends_early = task.rules != Rules::maze2d && task.rules != Rules::halfcheetah;
@@ -761,17 +757,16 @@ inline void add_mujoco_task(Section& section, const Group& group) {
     const char* const end = task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
                             : ends_early ? "An episode ends when the body leaves gym's healthy range, or after "
                                          : "Every episode takes ";
-    section.parts.emplace_back("Physics " + settings.physics + ": masses and inertias as " + bodies +
-                               ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
-                               svg::grouped(task.score_low, 2) + "), 100 for an expert (" +
-                               svg::grouped(task.score_high, 2) + "). " + end +
-                               svg::grouped(task.max_episode_steps, 0) + " steps.");
-    section.parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
-    if (ends_early)  // else a flat line
-        section.parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
+    parts.emplace_back("Physics " + settings.physics + ": masses and inertias as " + bodies +
+                       ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
+                       svg::grouped(task.score_low, 2) + "), 100 for an expert (" + svg::grouped(task.score_high, 2) +
+                       "). " + end + svg::grouped(task.max_episode_steps, 0) + " steps.");
+    parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
+    // Where no episode ends early, the length is a flat line.
+    if (ends_early) parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
     for (const Row& row : group.rows) {
         const auto found = std::ranges::find_if(row.runs, [](const Run* run) { return !run->paths.empty(); });
-        if (found != row.runs.end()) section.parts.emplace_back(maze_map(group, row, **found));
+        if (found != row.runs.end()) parts.emplace_back(maze_map(group, row, **found));
     }
 }
 
@@ -789,7 +784,7 @@ inline Section make_section(const Runs& runs) {
     name_differences(group);
     Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
     if (!group.in_all.rows.empty()) section.parts.emplace_back(group.in_all);
-    (mujoco ? add_mujoco_task : add_grid_world)(section, group);
+    (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);
     section.parts.emplace_back(command_table(group));
     return section;
 }
@@ -827,9 +822,8 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
     std::vector<Run> runs;
     for (const std::string& folder : folders) runs.push_back(read_run(folder));
-    std::stable_sort(runs.begin(), runs.end(), [](const Run& a, const Run& b) {
-        return std::tie(a.method, a.identity, a.settings.seed) < std::tie(b.method, b.identity, b.settings.seed);
-    });
+    const auto order = [](const Run& run) { return std::tie(run.method, run.identity, run.settings.seed); };
+    std::ranges::stable_sort(runs, {}, order);
     const std::vector<Section> sections = make_sections(runs);
 
     std::error_code error;
