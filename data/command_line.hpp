@@ -6,14 +6,8 @@
 #pragma once
 
 #include <csignal>
-#include <cstdio>
-#include <filesystem>
 #include <fstream>
-#include <new>
-#include <set>
-#include <thread>
 
-#include "../nn.hpp"
 #include "d4rl.hpp"
 #include "model_file.hpp"
 #include "settings.hpp"
@@ -22,20 +16,17 @@
 // Commands and options.
 
 struct Option {
-    const char* commands;  // that take it, separated by blanks
-    const char* name;
-    const char* value;     // placeholder of what follows it, or null for a switch
-    const char* fallback;  // its value where it is not given
-    const char* meaning;
+    const char *commands, *name;     // commands: that take it, separated by blanks
+    const char* value;               // placeholder of what follows it, or null for a switch
+    const char *fallback, *meaning;  // fallback: its value where it is not given
 };
 
 inline const Option option_table[] = {
-    {"import tasks", "--method", "NAME", "wodtem", "dt, odt or wodtem"},
-    {"train", "--method", "NAME", "", "dt, odt or wodtem; default wodtem"},
+    {"train import tasks", "--method", "NAME", "wodtem", "dt, odt or wodtem"},
     {"train", "--methods", "LIST", "", "several methods, separated by commas, one after the other"},
     {"train import sweep", "--preset", "NAME", "small",
      "paper: Tables I and II as printed; small: less of it; reduced: all of Table II but the network"},
-    {"train", "--seed", "N", "", "seed of everything but the data set; default 0"},
+    {"train", "--seed", "N", "0", "seed of everything but the data set"},
     {"train", "--seeds", "A-B", "", "several seeds, one after the other"},
     {"train import sweep", "--set", "NAME=VALUE", "", "any setting (see `wodtem tasks TASK`); may be repeated"},
     {"train import trace", "--physics", "NAME", "",
@@ -74,9 +65,10 @@ inline const Option option_table[] = {
 struct Arguments {
     std::vector<std::string> words;              // that are not options
     std::map<std::string, std::string> options;  // all that the command takes; "yes" or "" for a switch
+    std::set<std::string> given;                 // those on the command line
     std::vector<std::string> assignments;        // of --set, in order
     const std::string& operator[](const char* name) const { return options.at(name); }
-    bool has(const char* name) const { return !options.at(name).empty(); }
+    bool has(const char* name) const { return given.contains(name); }
 };
 
 struct Command {
@@ -88,12 +80,9 @@ struct Command {
 };
 
 inline std::vector<Option> options_of(const Command& command) {
-    std::vector<Option> taken;
-    for (const Option& option : option_table) {
-        const std::vector<std::string> takers = split(option.commands, ' ');
-        if (std::find(takers.begin(), takers.end(), command.name) != takers.end()) taken.push_back(option);
-    }
-    return taken;
+    std::vector<Option> options(std::begin(option_table), std::end(option_table));
+    std::erase_if(options, [&](const Option& option) { return !contains(split(option.commands, ' '), command.name); });
+    return options;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -104,7 +93,6 @@ inline Arguments parse_arguments(const Command& command, const std::vector<std::
     const std::vector<Option> taken = options_of(command);
     Arguments arguments;
     for (const Option& option : taken) arguments.options[option.name] = option.fallback;
-    std::set<std::string> seen;
     for (size_t i = 0; i < words.size(); ++i) {
         if (!words[i].starts_with("-") || words[i].size() < 2) {
             arguments.words.push_back(words[i]);
@@ -115,20 +103,15 @@ inline Arguments parse_arguments(const Command& command, const std::vector<std::
         const Option& option =
             row_named(taken, words[i], "usage.option",
                       std::string("wodtem ") + command.name + " has no option \"%s\"; the nearest is %s");
-        if (!option.value) {
-            arguments.options[option.name] = "yes";
-            continue;
-        }
-        if (i + 1 == words.size() || words[i + 1].starts_with("--"))
+        if (option.value && (i + 1 == words.size() || words[i + 1].starts_with("--")))
             fail("usage.option", "option %s needs a value: %s", option.name, option.value);
-        const std::string& value = words[++i];
+        const std::string value = option.value ? words[++i] : "yes";
         if (value.empty())
             fail("usage.option", "option %s needs a value that is not empty: %s", option.name, option.value);
-        if (std::string_view(option.name) == "--set") {
-            arguments.assignments.push_back(value);
-            continue;
-        }
-        if (!seen.insert(option.name).second) fail("usage.option", "option %s is given twice", option.name);
+        const bool is_set = std::string_view(option.name) == "--set";  // which, as a switch, may be repeated
+        if (!arguments.given.insert(option.name).second && option.value && !is_set)
+            fail("usage.option", "option %s is given twice", option.name);
+        if (is_set) arguments.assignments.push_back(value);
         arguments.options[option.name] = value;
     }
     if (arguments.words.size() < command.least_words || arguments.words.size() > command.most_words)
@@ -198,13 +181,7 @@ inline int run_program(std::span<const Command> commands, const std::vector<std:
 
 // Errors: usage.number.
 inline int64_t whole_number(const std::string& text, const char* name, int64_t low, int64_t high) {
-    const std::optional<double> x = to_number(text);
-    const double least = static_cast<double>(low), most = static_cast<double>(high);
-    if (!x || *x != std::floor(*x) || *x < least || *x > most)
-        fail("usage.number", "%s cannot be \"%s\"; it is a whole number from %lld to %lld; the nearest is %.0f", name,
-             text.c_str(), static_cast<long long>(low), static_cast<long long>(high),
-             std::round(std::clamp(x.value_or(least), least, most)));
-    return static_cast<int64_t>(*x);
+    return static_cast<int64_t>(number_in(text, "usage.number", name, low, high, true));
 }
 
 // "3", "0-4" or "1,3,8". Errors: usage.number.
@@ -212,13 +189,13 @@ inline std::vector<int64_t> seed_list(const std::string& text) {
     std::vector<int64_t> seeds;
     for (const std::string& range : split(text, ',')) {
         const size_t dash = range.find('-', 1);
-        const int64_t first = whole_number(range.substr(0, dash), "a seed", 0, 4294967295);
-        const int64_t last =
-            dash == std::string::npos ? first : whole_number(range.substr(dash + 1), "a seed", 0, 4294967295);
+        const auto seed_of = [](const std::string& number) { return whole_number(number, "a seed", 0, 4294967295); };
+        const int64_t first = seed_of(range.substr(0, dash));
+        const int64_t last = dash == std::string::npos ? first : seed_of(range.substr(dash + 1));
         if (last < first || last - first > 9999)
             fail("usage.number", "the seeds \"%s\" are not a range such as 0-4", range.c_str());
         for (int64_t seed = first; seed <= last; ++seed) {
-            if (std::find(seeds.begin(), seeds.end(), seed) != seeds.end())
+            if (contains(seeds, seed))
                 fail("usage.number", "seed %lld is given twice in \"%s\"", static_cast<long long>(seed), text.c_str());
             seeds.push_back(seed);
         }
@@ -227,11 +204,10 @@ inline std::vector<int64_t> seed_list(const std::string& text) {
 }
 
 // Of two options that exclude each other, "one" and "several of it", the list of values.
-inline std::string one_or_several(const Arguments& arguments, const char* one, const char* several,
-                                  const char* fallback) {
+inline const std::string& one_or_several(const Arguments& arguments, const char* one, const char* several) {
     if (arguments.has(one) && arguments.has(several))
         fail("usage.option", "%s and %s were both given; choose one", one, several);
-    return arguments.has(several) ? arguments[several] : arguments.has(one) ? arguments[one] : fallback;
+    return arguments[arguments.has(several) ? several : one];
 }
 
 // The processors that this process may use: those of its affinity mask, or fewer where a container limits its share of
@@ -317,18 +293,16 @@ inline void apply_assignments(Settings& settings, const std::vector<std::string>
         if (equals == std::string::npos)
             fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
         const std::string name = setting_row(assignment.substr(0, equals)).name;
-        if (std::find(std::begin(fixed), std::end(fixed), name) != std::end(fixed))
+        if (contains(fixed, name))
             fail("usage.setting", "%s is not given by --set; see wodtem train --help", name.c_str());
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
     }
 }
 
-// The settings of one run, for the options that train and import share. Errors: usage.*, dataset.missing.
-inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method,
-                            int64_t seed) {
+// The settings of one run but for its seed, for the options that train and import share. Errors: usage.*, dataset.missing.
+inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method) {
     Settings settings = default_settings(task, method, arguments["--preset"]);
-    settings.seed = seed;
     if (settings.task != "gridworld") {
         settings.mujoco = mujoco_version();
         choose_data_set(settings, arguments["--dataset"]);
@@ -344,7 +318,7 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
 
 // Of a network to import: those in the file, or with --task those of the command line. Errors: usage.*, settings.*.
 inline Settings imported_settings(const Arguments& arguments, const TensorFile& file) {
-    if (arguments.has("--task")) return settings_of(arguments, arguments["--task"], arguments["--method"], 0);
+    if (arguments.has("--task")) return settings_of(arguments, arguments["--task"], arguments["--method"]);
     if (file.metadata.contains("settings")) return settings_in(file);
     fail("usage.option", "%s does not tell its settings; give --task, and --method, --preset, --set as in train",
          file.path.c_str());
@@ -371,13 +345,14 @@ inline std::string folder_of(const Arguments& arguments, const Settings& setting
 
 // Every method with every seed, all checked before the first begins. Errors: usage.*, dataset.missing, file.*.
 inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
-    const std::vector<std::string> methods = split(one_or_several(arguments, "--method", "--methods", "wodtem"), ',');
-    const std::vector<int64_t> seeds = seed_list(one_or_several(arguments, "--seed", "--seeds", "0"));
+    const std::vector<std::string> methods = split(one_or_several(arguments, "--method", "--methods"), ',');
+    const std::vector<int64_t> seeds = seed_list(one_or_several(arguments, "--seed", "--seeds"));
     const size_t count = methods.size() * seeds.size();
     std::vector<PlannedRun> runs;
     for (const std::string& method : methods) {
         for (const int64_t seed : seeds) {
-            Settings settings = settings_of(arguments, arguments.words[0], method, seed);
+            Settings settings = settings_of(arguments, arguments.words[0], method);
+            settings.seed = seed;
             const std::string folder = folder_of(arguments, settings);
             if (arguments.has("--weights")) {
                 settings.weights_path = model_path(arguments["--weights"]);
@@ -414,9 +389,8 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
     const bool estimate = arguments.has("--estimate");
     const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
     std::string shared;
-    if (arguments.has("--dataset")) shared += " --dataset " + shell_word(arguments["--dataset"]);
-    if (arguments["--kernel"] != "auto") shared += " --kernel " + shell_word(arguments["--kernel"]);
-    if (arguments["--precision"] != "fp32") shared += " --precision " + shell_word(arguments["--precision"]);
+    for (const auto& [option, usual] : {std::pair("--dataset", ""), {"--kernel", "auto"}, {"--precision", "fp32"}})
+        if (arguments[option] != usual) shared += std::string(" ") + option + " " + shell_word(arguments[option]);
     for (const std::string& assignment : arguments.assignments) shared += " --set " + shell_word(assignment);
     for (const Settings& settings : sweep)
         for (const int64_t seed : seeds)

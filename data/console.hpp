@@ -15,9 +15,7 @@
 
 using Clock = std::chrono::steady_clock;
 
-inline double seconds_since(Clock::time_point then) {
-    return std::chrono::duration<double>(Clock::now() - then).count();
-}
+inline double seconds_since(Clock::time_point at) { return std::chrono::duration<double>(Clock::now() - at).count(); }
 
 // 75 seconds are 1:15, 3675 are 1:01:15.
 inline std::string clock_text(double seconds) {

@@ -13,15 +13,10 @@
 // Order: SVG elements; the whole figure; charts; maps of cells; tables and pages.
 #pragma once
 
-#include <algorithm>
 #include <charconv>
-#include <cmath>
-#include <string>
-#include <utility>
 #include <variant>
-#include <vector>
 
-#include "../nn.hpp"
+#include "../nn.hpp"  // and with it the other standard headers
 
 // ---------------------------------------------------------------------------------------------------------------------
 // SVG elements. Coordinates are in user units, x to the right, y downwards.
@@ -214,11 +209,9 @@ struct Chart {
     size_t points() const { return bars() ? categories.size() : x.size(); }
 };
 
-// The ends of the band or stroke at point i: one deviation from its mean, or none, as far as the quantity goes.
-struct Ends {
-    double low, high;
-};
-inline Ends ends_at(const Chart& chart, const Series& s, size_t i) {
+// The low and the high end of the band or stroke at point i: one deviation from its mean, or none, as far as the
+// quantity goes.
+inline std::pair<double, double> ends_at(const Chart& chart, const Series& s, size_t i) {
     const double mean = s.mean[i], deviation = drawable(s.deviation[i]) ? s.deviation[i] : 0;
     return {std::min(mean, std::max(mean - deviation, chart.low)),
             std::max(mean, std::min(mean + deviation, chart.high))};
@@ -227,9 +220,9 @@ inline Ends ends_at(const Chart& chart, const Series& s, size_t i) {
 // The axis covers the points with their bands or strokes, and the marks; of bars the zero too.
 inline Axis y_axis(const Chart& chart) {
     double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY;
-    const auto include = [&](const Ends& ends) {
-        low = std::min(low, ends.low);
-        high = std::max(high, ends.high);
+    const auto include = [&](const std::pair<double, double>& ends) {
+        low = std::min(low, ends.first);
+        high = std::max(high, ends.second);
     };
     for (const Series& s : chart.series)
         for (size_t i = 0; i < s.mean.size(); ++i)
@@ -279,10 +272,10 @@ inline void draw_line(const Series& s, const Chart& chart, const Axis& x, const 
     for (size_t i = 0; i < chart.points(); ++i) {
         if (!drawable(s.mean[i])) continue;
         const double px = x.at(chart.x[i]);
-        const Ends ends = ends_at(chart, s, i);
+        const auto [low, high] = ends_at(chart, s, i);
         middle += point(px, y.at(s.mean[i]));
-        upper += point(px, y.at(ends.high));
-        lower = point(px, y.at(ends.low)) + lower;
+        upper += point(px, y.at(high));
+        lower = point(px, y.at(low)) + lower;
         if (i + 1 < chart.points() && drawable(s.mean[i + 1])) continue;
         bands += path(upper + lower + "Z", fill(s.colour) + " fill-opacity=\"0.18\"");
         lines += path(middle, line_style(s)) + circle(px, y.at(s.mean[i]), 3, fill(s.colour));
@@ -300,9 +293,9 @@ inline std::string draw_bars(size_t k, const Chart& chart, const Axis& x, const 
         const double start = static_cast<double>(i) - 0.4 + share * static_cast<double>(k);
         const double left = x.at(start), w = x.at(start + 0.92 * share) - left, top = y.at(s.mean[i]);
         out += rectangle(left, top, w, y.at(0) - top, fill(s.colour));
-        const Ends ends = ends_at(chart, s, i);
+        const auto [low, high] = ends_at(chart, s, i);
         const double middle = left + w / 2;
-        if (ends.high > ends.low) out += line(middle, y.at(ends.high), middle, y.at(ends.low), stroke(ink, 1.5));
+        if (high > low) out += line(middle, y.at(high), middle, y.at(low), stroke(ink, 1.5));
     }
     return out;
 }

@@ -2,24 +2,17 @@
 // the list of tasks.
 #pragma once
 
-#include <cstdio>
-#include <filesystem>
-
 #include "d4rl.hpp"
-#include "safetensors.hpp"
-#include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Data sets.
 
 inline void print_datasets(const Hdf5File& file) {
     constexpr size_t listed = 40;
-    for (size_t i = 0; i < std::min(listed, file.datasets.size()); ++i) {
-        const Hdf5Dataset& dataset = file.datasets[i];
+    for (const Hdf5Dataset& dataset : file.datasets | std::views::take(listed))
         std::printf("  %-40s %-18s %-12s %zu bytes stored%s%s\n", json_string(dataset.path).c_str(),
                     shape_text(dataset.shape).c_str(), dataset.type.c_str(), dataset.stored,
                     dataset.unsupported.empty() ? "" : "; cannot be read: ", dataset.unsupported.c_str());
-    }
     if (file.datasets.size() > listed) std::printf("  and %zu more\n", file.datasets.size() - listed);
 }
 
@@ -66,22 +59,13 @@ inline void print_data_set(const std::string& path, std::string id) {
 // Least, greatest and mean of the finite numbers, and the count of the others.
 template <class T>
 std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
-    double low = INFINITY, high = -INFINITY, sum = 0;
-    size_t finite = 0, others = 0;
-    for (const T value : file.get<T>(tensor.name, tensor.shape)) {
-        const double x = static_cast<double>(value);
-        if (!std::isfinite(x)) {
-            ++others;
-            continue;
-        }
-        low = std::min(low, x);
-        high = std::max(high, x);
-        sum += x;
-        ++finite;
-    }
-    if (finite == 0) return "nothing finite";
+    std::vector<T> values = file.get<T>(tensor.name, tensor.shape);
+    const size_t others = std::erase_if(values, [](T x) { return !std::isfinite(static_cast<double>(x)); });
+    if (values.empty()) return "nothing finite";
+    Moments finite;
+    for (const T value : values) finite.add(static_cast<double>(value));
     char text[160];
-    std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g", low, high, sum / static_cast<double>(finite));
+    std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g", finite.low, finite.high, finite.mean());
     return text + (others > 0 ? ", NOT FINITE: " + std::to_string(others) : std::string());
 }
 

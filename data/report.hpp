@@ -12,53 +12,40 @@
 // Order: logs; one run folder; numbers; the paper's results; figures; tables; sections; the report.
 #pragma once
 
-#include <array>
-#include <filesystem>
-#include <map>
-#include <ranges>
-#include <set>
-#include <tuple>
-
-#include "../gridworld.hpp"
-#include "../mujoco_env.hpp"
 #include "figures.hpp"
-#include "safetensors.hpp"
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Logs
 
-// Comma-separated values: one header line, every line ended by a line feed, no quotes.
-// Errors: csv.unfinished, csv.fields, each with `path` and the line.
-inline Table parse_csv(const std::string& text, const std::string& path) {
-    const std::vector<std::string> lines = split(text, '\n');  // what follows the last line feed is the last part
-    if (lines.size() < 2 || !lines.back().empty())
-        fail("csv.unfinished", "%s: line %zu does not end; the file was cut off or is still being written",
-             path.c_str(), lines.size());
-    Table table{split(lines[0], ','), {}};
-    for (size_t i = 1; i + 1 < lines.size(); ++i) {
-        table.rows.push_back(split(lines[i], ','));
-        if (table.rows.back().size() != table.header.size())
-            fail("csv.fields", "%s: line %zu has %zu fields, the header has %zu", path.c_str(), i + 1,
-                 table.rows.back().size(), table.header.size());
-    }
-    return table;
-}
-
 namespace results {  // the training program has names of its own: Run, Spread, ...
 
 constexpr double none = NAN;
 
-// A CSV file with its path, which its errors name.
+// Comma-separated values: one header line, every line ended by a line feed, no quotes. Errors name `path` and the line.
 struct Log {
     std::string path;
-    Table table;
+    Table table = {};
 
-    explicit Log(const std::string& file) : path(file), table(parse_csv(read_file(file), file)) {}
+    // Errors: csv.unfinished, csv.fields.
+    Log(const std::string& file, const std::string& text) : path(file) {
+        const std::vector<std::string> lines = split(text, '\n');  // what follows the last line feed is the last part
+        if (lines.size() < 2 || !lines.back().empty())
+            fail("csv.unfinished", "%s: line %zu does not end; the file was cut off or is still being written",
+                 path.c_str(), lines.size());
+        table.header = split(lines[0], ',');
+        for (size_t i = 1; i + 1 < lines.size(); ++i) {
+            const std::vector<std::string>& row = table.rows.emplace_back(split(lines[i], ','));
+            if (row.size() != table.header.size())
+                fail("csv.fields", "%s: line %zu has %zu fields, the header has %zu", path.c_str(), i + 1, row.size(),
+                     table.header.size());
+        }
+    }
+    explicit Log(const std::string& file) : Log(file, read_file(file)) {}
 
     // One column from top to bottom. Errors: csv.column.
     std::vector<std::string> texts(const char* column) const {
-        const auto found = std::find(table.header.begin(), table.header.end(), column);
+        const auto found = std::ranges::find(table.header, column);
         if (found == table.header.end()) fail("csv.column", "%s: line 1 has no column \"%s\"", path.c_str(), column);
         std::vector<std::string> out;
         for (const auto& row : table.rows) out.push_back(row[found - table.header.begin()]);
@@ -86,18 +73,20 @@ struct Log {
         const std::vector<double> out = numbers("interactions", 0, 1e12);
         const auto falls = std::is_sorted_until(out.begin(), out.end());
         if (falls != out.end())
-            fail("csv.order", "%s: line %zu: column \"interactions\" falls to %.0f", path.c_str(),
-                 static_cast<size_t>(falls - out.begin()) + 2, *falls);
+            fail("csv.order", "%s: line %td: column \"interactions\" falls to %.0f", path.c_str(),
+                 falls - out.begin() + 2, *falls);
         return out;
     }
 
-    // A column must hold these texts, from top to bottom. Errors: csv.rows.
-    void check_column(const char* column, const std::vector<std::string>& expected) const {
+    // A column must hold text_of(i) for i from 0 to count - 1, from top to bottom. Errors: csv.rows.
+    void check_column(const char* column, int count, auto&& text_of) const {
+        std::vector<std::string> expected;
+        for (int i = 0; i < count; ++i) expected.push_back(text_of(i));
         const std::vector<std::string> got = texts(column);
-        const auto differs = std::mismatch(got.begin(), got.end(), expected.begin(), expected.end()).first;
+        const auto differs = std::ranges::mismatch(got, expected).in1 - got.begin();
         if (got != expected)
-            fail("csv.rows", "%s: line %zu: column \"%s\" does not name the %zu cells or moves in their order",
-                 path.c_str(), static_cast<size_t>(differs - got.begin()) + 2, column, expected.size());
+            fail("csv.rows", "%s: line %td: column \"%s\" does not name the %d cells or moves in their order",
+                 path.c_str(), differs + 2, column, count);
     }
 };
 
@@ -128,7 +117,7 @@ using Identity = std::vector<std::variant<bool, int64_t, double, std::string>>;
 
 struct Run {
     std::string folder, command;
-    Settings settings;
+    Settings settings, usual;  // usual: what task, method and preset make them
     Identity identity;
     size_t method = 0;                   // in `methods`
     const MujocoTask* mujoco = nullptr;  // null: the grid world
@@ -149,13 +138,8 @@ using Summary = double (*)(const Run&, Quantity);  // final_value or last_ten
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
 inline std::vector<MoveShares> read_policy(const Log& log) {
-    std::vector<std::string> rows, columns;
-    for (int cell = 0; cell < grid_cells; ++cell) {
-        rows.push_back(std::to_string(cell / grid_size));
-        columns.push_back(std::to_string(cell % grid_size));
-    }
-    log.check_column("row", rows);
-    log.check_column("column", columns);
+    log.check_column("row", grid_cells, [](int cell) { return std::to_string(cell / grid_size); });
+    log.check_column("column", grid_cells, [](int cell) { return std::to_string(cell % grid_size); });
     std::vector<MoveShares> out(grid_cells);
     for (int move = 0; move < grid_moves; ++move) {
         const std::vector<double> shares = log.numbers(grid_move_table[move].name, 0, 1);
@@ -166,9 +150,7 @@ inline std::vector<MoveShares> read_policy(const Log& log) {
 
 // start_actions.csv: one row for each move; D_online is NaN without an online phase. Errors: csv.rows, csv.number.
 inline std::array<std::vector<double>, 3> read_start_actions(const Log& log) {
-    std::vector<std::string> moves;
-    for (const GridMove& move : grid_move_table) moves.emplace_back(move.name);
-    log.check_column("move", moves);
+    log.check_column("move", grid_moves, [](int move) { return grid_move_table[move].name; });
     return {log.numbers("learned", 0, 1), log.numbers("offline", 0, 1), log.numbers("online", 0, 1, true)};
 }
 
@@ -218,6 +200,7 @@ inline Run read_run(const std::string& folder) {
     Run run;
     run.folder = folder;
     run.settings = settings_from_text(read_file(file("settings")), file("settings"));
+    run.usual = default_settings(run.settings.task, run.settings.method, run.settings.preset);
     run.command = exists("command") ? split(read_file(file("command")), '\n')[0] : train_command(run.settings);
     run.identity = identity_of(run.settings);
     while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
@@ -262,9 +245,8 @@ inline Spread spread_of(std::vector<double> values) {
     std::erase_if(values, [](double value) { return std::isnan(value); });
     Spread out{values.size(), none, none};
     const auto n = static_cast<double>(values.size());
-    double sum = 0, squares = 0;
-    for (const double value : values) sum += value;
-    if (n > 0) out.mean = sum / n;
+    double squares = 0;
+    if (n > 0) out.mean = std::accumulate(values.begin(), values.end(), 0.0) / n;
     for (const double value : values) squares += (value - out.mean) * (value - out.mean);
     if (n > 1) out.deviation = std::sqrt(squares / (n - 1));
     return out;
@@ -313,11 +295,12 @@ inline Spread spread_of(const Runs& runs, Summary summary, Quantity quantity) {
     return spread_of(values);
 }
 
+inline double most_interactions(const Runs& runs) { return std::ranges::max(runs, {}, &Run::so_far)->so_far; }
+
 // Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run;
 // long runs in larger steps, at most about 400. There are at least two points.
 inline std::vector<double> curve_points(const Runs& runs) {
-    double largest = 250;
-    for (const Run* run : runs) largest = std::max(largest, run->so_far);
+    const double largest = std::max(250.0, most_interactions(runs));
     const double step = 250 * std::ceil(largest / 250 / 400);
     std::vector<double> out;
     for (double at = 0; at <= largest; at += step) out.push_back(at);
@@ -448,12 +431,12 @@ struct Row {
 
 // Runs of one task, preset and physics.
 struct Group {
-    Runs runs;                             // by method, then by the other settings, then by seed
-    std::string task, conditions, file;    // conditions: preset and physics; file: the beginning of the figures' names
-    Quantity quantity;                     // which is compared with the paper
-    const char* unit;                      // its name
-    std::vector<Row> rows = {};            // in the order of the runs
-    std::vector<std::string> in_all = {};  // what all runs have in another way than the preset
+    Runs runs;                           // by method, then by the other settings, then by seed
+    std::string task, conditions, file;  // conditions: preset and physics; file: the beginning of the figures' names
+    Quantity quantity;                   // which is compared with the paper
+    std::string unit;                    // its name
+    std::vector<Row> rows = {};          // in the order of the runs
+    Table in_all = {{"Other than the preset, in all of these runs"}, {}};
 
     const Run& any() const { return *runs[0]; }
     std::string heading() const { return task + ", " + conditions; }
@@ -498,14 +481,13 @@ inline void name_differences(Group& group) {
         std::set<std::string> departures;  // of the rows; "": none
         std::set<size_t> methods_that_depart;
         for (const Row& row : group.rows) {
-            const Settings& settings = row.any().settings;
-            const Settings usual = default_settings(settings.task, settings.method, settings.preset);
-            const bool departs = setting_text(settings, setting) != setting_text(usual, setting);
-            departures.insert(departs ? shown_setting(settings, setting) : "");
-            if (departs) methods_that_depart.insert(row.any().method);
+            const Run& run = row.any();
+            const bool departs = setting_text(run.settings, setting) != setting_text(run.usual, setting);
+            departures.insert(departs ? shown_setting(run.settings, setting) : "");
+            if (departs) methods_that_depart.insert(run.method);
         }
         if (departures.size() == 1) {
-            if (!departures.begin()->empty()) group.in_all.push_back(*departures.begin());
+            if (!departures.begin()->empty()) group.in_all.rows.push_back({*departures.begin()});
             continue;
         }
         for (Row& row : group.rows)
@@ -537,8 +519,7 @@ inline Figure curve(const Group& group, Quantity quantity, const std::string& ca
     chart.x = curve_points(group.runs);
     const MujocoTask* task = group.any().mujoco;
     if (length) {
-        const bool torus =
-            std::ranges::any_of(group.runs, [](const Run* run) { return run->settings.edge == "wraps"; });
+        const bool torus = std::ranges::any_of(group.runs, [](auto* run) { return run->settings.edge == "wraps"; });
         chart.low = task || torus ? 1 : grid_size - 1;  // the goal lies that many diagonal moves from S
         chart.high = task ? task->max_episode_steps : grid_max_steps;
     } else if (task && task->maze) {  // a reward is 0 or 1, and antmaze's 1 is the last
@@ -623,13 +604,10 @@ inline Figure policy_map(const Group& group, const Row& row) {
 }
 
 // The map of a maze without paths; `map`: rows from the top, each ended by a slash; 1: wall, all else is free.
-inline svg::CellMap maze_cells(const std::string& title, const std::string& map) {
-    std::vector<std::string> rows = split(map, '/');
-    rows.pop_back();
-    svg::CellMap out{title, static_cast<int>(rows.size()), static_cast<int>(rows.at(0).size())};
-    for (int row = 0; row < out.rows; ++row)
-        for (int column = 0; column < out.columns; ++column)
-            if (rows[row][column] == '1') out.fill_cell(svg::Place(row, column), "#C8C8C8");
+inline svg::CellMap maze_cells(const std::string& title, const char* map) {
+    const std::vector<MazeCell> walls = cells_marked(map, '1');  // which surround the map: the last is its corner
+    svg::CellMap out{title, walls.back().row + 1, walls.back().column + 1};
+    for (const auto& [row, column] : walls) out.fill_cell(svg::Place(row, column), "#C8C8C8");
     out.keys = {{svg::start_mark(13, 0, svg::faint_ink), "start"},
                 {svg::end_mark(13, 0, svg::faint_ink), "end"},
                 {svg::circle(13, 0, 8, svg::stroke(svg::faint_ink, 1.5)), "goal (radius 0.5 m)"}};
@@ -667,9 +645,7 @@ inline Figure maze_map(const Group& group, const Row& row, const Run& run) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tables and sentences
 
-inline long unfinished(const Runs& runs) {
-    return std::count_if(runs.begin(), runs.end(), [](const Run* run) { return !run->finished; });
-}
+inline long unfinished(const Runs& runs) { return std::ranges::count(runs, false, &Run::finished); }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
 inline std::string compared(const Row& row, Quantity quantity, const PaperResult& paper) {
@@ -695,11 +671,9 @@ inline std::string verdict(const Group& group) {
     std::string out = group.heading() + ", final " + group.unit + ": ";
     for (const Row& row : std::views::reverse(group.rows))
         out += compared(row, group.quantity, *paper_result(row.any())) + (&row == &group.rows[0] ? "" : "; ");
-    double interactions = 0;
-    for (const Run* run : group.runs) interactions = std::max(interactions, run->so_far);
-    if (interactions > 0)
-        out += "; online interactions: up to " + svg::grouped(interactions, 0) + ", paper " +
-               (any.mujoco ? "200,000" : "20,000");
+    if (const double far = most_interactions(group.runs); far > 0)
+        out +=
+            "; online interactions: up to " + svg::grouped(far, 0) + ", paper " + (any.mujoco ? "200,000" : "20,000");
     const auto has_other_data = [](const Run* run) {
         return run->mujoco && run->settings.source.at("dataset") != "D4RL's published file";
     };
@@ -710,8 +684,7 @@ inline std::string verdict(const Group& group) {
 // One line for each row: the number of seeds, our results as mean ± deviation over them, and the paper's.
 inline Table method_table(const Group& group) {
     const bool scores = group.quantity != &Run::length;
-    Table table{{"Method", "Seeds", std::string("Final ") + group.unit, "Mean of last 10", "Paper", "Final return"},
-                {}};
+    Table table{{"Method", "Seeds", "Final " + group.unit, "Mean of last 10", "Paper", "Final return"}, {}};
     if (scores) table.header.push_back("Final length");
     for (const Row& row : group.rows) {
         const auto mean = [&](Summary summary, Quantity quantity) {
@@ -730,7 +703,7 @@ inline Table method_table(const Group& group) {
 // One row for each run: how far it came, its own results, and where it lies.
 inline Table run_table(const Group& group) {
     const bool grid = !group.any().mujoco;
-    Table table{{"Run", "State", "Interactions", std::string("Final ") + group.unit, "Last 10"}, {}};
+    Table table{{"Run", "State", "Interactions", "Final " + group.unit, "Last 10"}, {}};
     if (grid) table.header.insert(table.header.end(), {"Shortest met", "At 5 from"});
     table.header.push_back("Folder");
     for (const Row& row : group.rows)
@@ -757,44 +730,43 @@ inline Table command_table(const Group& group) {
 // Sections, each of one group
 
 // Tables and figures of the grid world, in the paper's order of figures.
-inline void add_grid_world(Section& section, const Group& group) {
-    section.parts.emplace_back(
+inline void add_grid_world(std::vector<Part>& parts, const Group& group) {
+    parts.emplace_back(
         "Lengths are in steps. Shortest met: the shortest online episode that reached the goal. At 5 from: the online "
         "interactions of the first evaluation from which on every one took 5 steps, the length of the shortest path "
         "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps.");
-    section.parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
-    if (!group.rows.back().any().offline_only()) section.parts.emplace_back(histogram(group));
+    parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
+    if (!group.rows.back().any().offline_only()) parts.emplace_back(histogram(group));
     std::vector<Figure> maps;
     for (Row row : group.rows) {
         std::erase_if(row.runs, [](const Run* run) { return !run->finished; });
         if (row.runs.empty()) continue;
-        if (!row.any().offline_only()) section.parts.emplace_back(start_actions(group, row));
+        if (!row.any().offline_only()) parts.emplace_back(start_actions(group, row));
         maps.push_back(policy_map(group, row));
     }
-    section.parts.insert(section.parts.end(), maps.begin(), maps.end());
+    parts.insert(parts.end(), maps.begin(), maps.end());
 }
 
 // Any other task: what its numbers rest on, curves, and in mazes one run's paths for each row.
-inline void add_mujoco_task(Section& section, const Group& group) {
+inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
     const Settings& settings = group.any().settings;
     const MujocoTask& task = *group.any().mujoco;
     const bool ends_early = task.rules != Rules::maze2d && task.rules != Rules::halfcheetah;
-    section.parts.emplace_back("Physics " + settings.physics + ": masses and inertias as " +
-                               (settings.physics == "d4rl" ? "in MuJoCo up to 2.1.0, which made D4RL's data"
-                                                           : "MuJoCo 2.2 computes them from the geometry") +
-                               ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
-                               svg::grouped(task.score_low, 2) + "), 100 for an expert (" +
-                               svg::grouped(task.score_high, 2) + "). " +
-                               (task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
-                                : ends_early ? "An episode ends when the body leaves gym's healthy range, or after "
-                                             : "Every episode takes ") +
-                               svg::grouped(task.max_episode_steps, 0) + " steps.");
-    section.parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
-    if (ends_early)  // else a flat line
-        section.parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
+    const char* const bodies = settings.physics == "d4rl" ? "in MuJoCo up to 2.1.0, which made D4RL's data"
+                                                          : "MuJoCo 2.2 computes them from the geometry";
+    const char* const end = task.rules == Rules::antmaze ? "An episode ends at the goal, or after "
+                            : ends_early ? "An episode ends when the body leaves gym's healthy range, or after "
+                                         : "Every episode takes ";
+    parts.emplace_back("Physics " + settings.physics + ": masses and inertias as " + bodies +
+                       ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
+                       svg::grouped(task.score_low, 2) + "), 100 for an expert (" + svg::grouped(task.score_high, 2) +
+                       "). " + end + svg::grouped(task.max_episode_steps, 0) + " steps.");
+    parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
+    // Where no episode ends early, the length is a flat line.
+    if (ends_early) parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
     for (const Row& row : group.rows) {
         const auto found = std::ranges::find_if(row.runs, [](const Run* run) { return !run->paths.empty(); });
-        if (found != row.runs.end()) section.parts.emplace_back(maze_map(group, row, **found));
+        if (found != row.runs.end()) parts.emplace_back(maze_map(group, row, **found));
     }
 }
 
@@ -811,12 +783,8 @@ inline Section make_section(const Runs& runs) {
                 rows_of(runs)};
     name_differences(group);
     Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
-    if (!group.in_all.empty()) {
-        Table table{{"Other than the preset, in all of these runs"}, {}};
-        for (const std::string& setting : group.in_all) table.rows.push_back({setting});
-        section.parts.emplace_back(table);
-    }
-    (mujoco ? add_mujoco_task : add_grid_world)(section, group);
+    if (!group.in_all.rows.empty()) section.parts.emplace_back(group.in_all);
+    (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);
     section.parts.emplace_back(command_table(group));
     return section;
 }
@@ -854,9 +822,8 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
     std::vector<Run> runs;
     for (const std::string& folder : folders) runs.push_back(read_run(folder));
-    std::stable_sort(runs.begin(), runs.end(), [](const Run& a, const Run& b) {
-        return std::tie(a.method, a.identity, a.settings.seed) < std::tie(b.method, b.identity, b.settings.seed);
-    });
+    const auto order = [](const Run& run) { return std::tie(run.method, run.identity, run.settings.seed); };
+    std::ranges::stable_sort(runs, {}, order);
     const std::vector<Section> sections = make_sections(runs);
 
     std::error_code error;

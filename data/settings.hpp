@@ -12,28 +12,13 @@
 // The other headers of data/ that include this one have what it includes.
 #pragma once
 
-#include <algorithm>
 #include <cctype>
-#include <charconv>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <filesystem>
-#include <map>
-#include <memory>
-#include <optional>
-#include <ranges>
 #include <set>
-#include <span>
-#include <string>
-#include <string_view>
 #include <variant>
-#include <vector>
 
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
-#include "../nn.hpp"
-#include "safetensors.hpp"
+#include "safetensors.hpp"  // and with it the other standard headers
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Text.
@@ -50,6 +35,8 @@ inline std::string trimmed(std::string_view text) {
     if (first == std::string_view::npos) return "";
     return std::string(text.substr(first, text.find_last_not_of(" \t") + 1 - first));
 }
+
+inline bool contains(const auto& all, const auto& one) { return std::ranges::find(all, one) != std::end(all); }
 
 // The shortest text that reads back as the same number, of whatever type it is.
 inline std::string number_text(auto x) {
@@ -74,6 +61,19 @@ inline std::optional<double> to_number(const std::string& text) {
     const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), x);
     if (error != std::errc() || end != text.data() + text.size() || !std::isfinite(x)) return std::nullopt;
     return x;
+}
+
+// The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest number
+// in it; `name` begins the sentence.
+inline double number_in(const std::string& text, const char* id, const char* name, auto low, auto high, bool whole) {
+    const double least = static_cast<double>(low), most = static_cast<double>(high);
+    const std::optional<double> x = to_number(text);
+    const double within = std::clamp(x.value_or(least), least, most), nearest = whole ? std::round(within) : within;
+    if (x != nearest)
+        fail(id, "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", name, text.c_str(),
+             whole ? "whole " : "", number_text(low).c_str(), number_text(high).c_str(),
+             number_text(static_cast<decltype(low)>(nearest)).c_str());
+    return *x;
 }
 
 // `text` as one word of a shell command: between single quotes where a character could mean something to a shell.
@@ -102,20 +102,16 @@ inline int edit_distance(const std::string& a, const std::string& b) {
 
 // The name with the least edit distance; of several, the first.
 inline std::string nearest_name(const std::string& name, const std::vector<std::string>& names) {
-    return *std::min_element(names.begin(), names.end(), [&](const std::string& a, const std::string& b) {
-        return edit_distance(name, a) < edit_distance(name, b);
-    });
+    return std::ranges::min(names, {}, [&](const std::string& other) { return edit_distance(name, other); });
 }
 
 // The row of a table that has this name. `sentence` is a format of two texts: the name, and the nearest one.
 // Errors: `id`, if there is none.
 inline const auto& row_named(const auto& rows, const std::string& name, const char* id, const std::string& sentence) {
-    std::vector<std::string> names;
-    for (const auto& row : rows) {
-        if (name == row.name) return row;
-        names.push_back(row.name);
-    }
-    fail(id, sentence.c_str(), name.c_str(), nearest_name(name, names).c_str());
+    const auto distance = [&](const auto& row) { return edit_distance(name, row.name); };
+    const auto& nearest = *std::ranges::min_element(rows, {}, distance);
+    if (name != nearest.name) fail(id, sentence.c_str(), name.c_str(), nearest.name);
+    return nearest;
 }
 
 // The index of `name` among an enumeration's names, which hold it.
@@ -345,7 +341,7 @@ inline std::string setting_text(const Settings& settings, const SettingRow& row)
 // the three functions: usage.setting with what is allowed.
 inline void parse_value(const SettingRow& row, const std::string& text, std::string& value) {
     const std::vector<std::string> choices = split(row.choices, '|');
-    if (*row.choices != 0 && std::find(choices.begin(), choices.end(), text) == choices.end())
+    if (*row.choices != 0 && !contains(choices, text))
         fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
              row.choices, nearest_name(text, choices).c_str());
     value = text;
@@ -360,13 +356,7 @@ inline void parse_value(const SettingRow& row, const std::string& text, bool& va
 template <class Number>
 void parse_value(const SettingRow& row, const std::string& text, Number& value) {
     constexpr bool whole = std::is_integral_v<Number>;
-    const std::optional<double> x = to_number(text);
-    const double nearest = std::clamp(x.value_or(row.low), row.low, row.high);
-    if (x != nearest || (whole && *x != std::floor(*x)))
-        fail("usage.setting", "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", row.name,
-             text.c_str(), whole ? "whole " : "", number_text(row.low).c_str(), number_text(row.high).c_str(),
-             number_text(whole ? std::round(nearest) : nearest).c_str());
-    value = static_cast<Number>(*x);
+    value = static_cast<Number>(number_in(text, "usage.setting", row.name, row.low, row.high, whole));
 }
 
 inline void set_setting(Settings& settings, const std::string& name, const std::string& text) {
@@ -463,16 +453,14 @@ inline std::string unquoted(const std::string& text) {
     std::string value;
     for (size_t at = 1; at + 1 < text.size(); ++at) {
         if (text[at] == '"') return text;
-        if (text[at] == '\\') {
-            const std::string_view code = std::string_view(text).substr(at, 4);  // \xHH
-            uint8_t byte = 0;
-            const char* const end = code.data() + code.size();
-            if (!code.starts_with("\\x") || std::from_chars(code.data() + 2, end, byte, 16).ptr != end) return text;
-            value += static_cast<char>(byte);
-            at += 3;
-        } else {
-            value += text[at];
-        }
+        value += text[at];
+        if (text[at] != '\\') continue;
+        const std::string_view code = std::string_view(text).substr(at, 4);  // \xHH
+        uint8_t byte = 0;
+        const char* const end = code.data() + code.size();
+        if (!code.starts_with("\\x") || std::from_chars(code.data() + 2, end, byte, 16).ptr != end) return text;
+        value.back() = static_cast<char>(byte);
+        at += 3;
     }
     return value;
 }

@@ -745,12 +745,12 @@ TEST(csv_errors_name_the_line) {
     CHECK_FAILS("csv.number", log.numbers("loss", -1, 0));
     CHECK_FAILS("csv.number", log.numbers("step", 0, 999));
     CHECK_FAILS("csv.column", log.numbers("los", 0, 1));
-    CHECK_FAILS("csv.unfinished", parse_csv("", "f"));
-    CHECK_FAILS("csv.unfinished", parse_csv("a,b\n1,2", "f"));
-    CHECK_FAILS("csv.fields", parse_csv("a,b\n1\n", "f"));
-    CHECK_FAILS("csv.fields", parse_csv("a,b\n\n", "f"));
+    CHECK_FAILS("csv.unfinished", Log("f", ""));
+    CHECK_FAILS("csv.unfinished", Log("f", "a,b\n1,2"));
+    CHECK_FAILS("csv.fields", Log("f", "a,b\n1\n"));
+    CHECK_FAILS("csv.fields", Log("f", "a,b\n\n"));
     try {
-        parse_csv("a,b\n1,2\n1,2,3\n", "progress.csv");
+        Log("progress.csv", "a,b\n1,2\n1,2,3\n");
     } catch (const Error& error) {
         CHECK_EQUAL(std::string(error.what()), "progress.csv: line 3 has 3 fields, the header has 2");
     }

@@ -1020,7 +1020,7 @@ TEST(signals_end_a_run_at_once_whatever_it_is_doing) {
 TEST(evaluation_needs_the_model_file_alone) {
     const Scratch scratch;
     quiet_train(tiny_settings("wodtem"), scratch / "run");
-    const Table progress = parse_csv(read_file(scratch / "run/progress.csv"), "progress.csv");
+    const Table progress = results::Log(scratch / "run/progress.csv").table;
     fs::rename(scratch / "run/model.safetensors", scratch / "model.safetensors");
     fs::remove_all(scratch / "run");
     const TensorFile file = open_model(scratch / "model.safetensors");
@@ -1037,8 +1037,8 @@ TEST(evaluation_needs_the_model_file_alone) {
 TEST(progress_rows_keep_to_the_schedule) {
     const Scratch scratch;
     quiet_train(tiny_settings("wodtem"), scratch / "run");
-    const Table progress = parse_csv(read_file(scratch / "run/progress.csv"), "progress.csv");
-    const Table episodes = parse_csv(read_file(scratch / "run/episodes.csv"), "episodes.csv");
+    const Table progress = results::Log(scratch / "run/progress.csv").table;
+    const Table episodes = results::Log(scratch / "run/episodes.csv").table;
     CHECK_EQUAL(progress.rows[0][0], "offline");
     CHECK_EQUAL(progress.rows[0][1], "40");
     size_t interactions = 0;
@@ -1475,7 +1475,7 @@ TEST(mujoco_runs_depend_on_neither_threads_nor_interruptions) {
                         read_file(scratch / (std::string(other) + name)))
                         report_failure(__FILE__, __LINE__, std::string(task) + ": " + other + name + " differs");
         CHECK_EQUAL(fs::exists(scratch / "1/paths.csv"), std::string(task) != "hopper-v2");
-        const Table progress = parse_csv(read_file(scratch / "1/progress.csv"), "progress.csv");
+        const Table progress = results::Log(scratch / "1/progress.csv").table;
         CHECK_EQUAL(progress.rows.back().back(), "d4rl on MuJoCo " + mujoco_version());
         CHECK_CLOSE(std::stod(progress.rows.back()[14]),
                     normalised_score(*find_mujoco_task(task), std::stod(progress.rows.back()[13])), 1e-9);
@@ -1503,7 +1503,7 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     for (const char* name : {"progress.csv", "episodes.csv", "model.safetensors", "paths.csv"})
         CHECK(read_file(scratch / (std::string("whole/") + name)) ==
               read_file(scratch / (std::string("stopped/") + name)));
-    const Table progress = parse_csv(read_file(scratch / "whole/progress.csv"), "progress.csv");
+    const Table progress = results::Log(scratch / "whole/progress.csv").table;
     CHECK_EQUAL(progress.rows[0][0], "offline");
     CHECK(std::stod(progress.rows[0][5]) > 0);  // something was learned from
     stop_requested = 1;
