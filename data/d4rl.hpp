@@ -126,16 +126,16 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
                           std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
     const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
-    if (!found && std::ranges::any_of(file.datasets, below))
-        throw Error("dataset.shape", file.path + ": \"" + name + "\" is a group; write one table of numbers instead");
-    if (!found)
-        throw Error("dataset.shape", file.path + ": has no data set \"" + name + "\"; it is not in D4RL's layout");
+    require(found || std::ranges::none_of(file.datasets, below), "dataset.shape", file.path, ": \"", name,
+            "\" is a group; write one table of numbers instead");
+    require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
     const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
-    if (shape.empty() || shape.size() > 2 || shape[0] != rows.value_or(shape[0]) || width != columns.value_or(width))
-        throw Error("dataset.shape", file.path + ": \"" + name + "\" has shape " + shape_text(shape) + ", expected " +
-                                         text(rows) + " by " + text(columns));
+    const bool table = shape.size() == 1 || shape.size() == 2;
+    require(table && shape[0] == rows.value_or(shape[0]) && width == columns.value_or(width), "dataset.shape",
+            file.path, ": \"", name, "\" has shape ", shape_text(shape), ", expected ", text(rows), " by ",
+            text(columns));
     return {*found, shape[0], width};
 }
 
@@ -145,11 +145,10 @@ inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std
         const std::set<std::string> known = {"observations", "actions", "rewards", "terminals", "next_observations"};
         if (name.find('/') != std::string::npos || known.contains(name) || name == ends) continue;
         const Hdf5Dataset* column = file.find(name);
-        if (column && !column->shape.empty() && column->shape[0] == rows)
-            fail("dataset.column",
-                 "%s: \"%s\" has a row for each step and is not read beside %s; name what marks the ends of episodes "
-                 "timeouts, and move the rest to a group such as infos",
-                 file.path.c_str(), name.c_str(), ends.c_str());
+        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column", file.path, ": \"", name,
+                "\" has a row for each step and is not read beside ", ends,
+                "; name what marks the ends of episodes "
+                "timeouts, and move the rest to a group such as infos");
     }
 }
 
@@ -160,14 +159,14 @@ inline Rows read_rows(const Hdf5File& file) {
     rows.count = states.rows;
     rows.state_dim = states.columns;
     rows.action_dim = actions.columns;
-    if (rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0)
-        fail("dataset.shape", "%s: holds no steps", file.path.c_str());
+    const bool empty = rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0;
+    require(!empty, "dataset.shape", file.path, ": holds no steps");
     const auto column = [&](const char* name) -> const Hdf5Dataset& {
         return table_of(file, name, rows.count, 1).data;
     };
-    rows.observations = file.read_floats(states.data);
-    rows.actions = file.read_floats(actions.data);
-    rows.rewards = file.read_floats(column("rewards"));
+    rows.observations = file.read<float>(states.data);
+    rows.actions = file.read<float>(actions.data);
+    rows.rewards = file.read<float>(column("rewards"));
     rows.terminals = file.read_flags(column("terminals"));
     const std::string ends =
         file.find("episode_terminals") && !file.find("timeouts") ? "episode_terminals" : "timeouts";
@@ -176,7 +175,7 @@ inline Rows read_rows(const Hdf5File& file) {
     if (ends == "episode_terminals")  // also set where the task ended the episode, which is no timeout
         for (size_t row = 0; row < rows.count; ++row) rows.timeouts[row] &= rows.terminals[row] == 0;
     if (file.find("next_observations"))
-        rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim).data);
+        rows.next_observations = file.read<float>(table_of(file, "next_observations", rows.count, rows.state_dim).data);
     return rows;
 }
 
@@ -198,9 +197,8 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     std::set<uint64_t> episodes;
     for (const std::string& name : file.names()) {
         const std::optional<uint64_t> episode = minari_episode(name);
-        if (!episode)
-            fail("dataset.column", "%s: \"%s\" lies in none of Minari's groups episode_0, episode_1, ...",
-                 file.path.c_str(), name.c_str());
+        require(episode.has_value(), "dataset.column", file.path, ": \"", name,
+                "\" lies in none of Minari's groups episode_0, episode_1, ...");
         episodes.insert(*episode);
     }
     const auto stated = file.attributes.find("total_episodes");
@@ -223,20 +221,18 @@ inline Rows read_minari(const Hdf5File& file) {
         if (rows.count == 0) rows.state_dim = states.columns;
         if (rows.count == 0) rows.action_dim = actions.columns;
         const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
-        if (states.columns != rows.state_dim || actions.columns != rows.action_dim || empty)
-            fail(
-                "dataset.shape",
-                "%s: %sobservations and actions have %zu and %zu columns, %zu steps; the first has %zu and %zu columns",
-                file.path.c_str(), group.c_str(), size_t{states.columns}, size_t{actions.columns}, size_t{steps},
-                rows.state_dim, rows.action_dim);
+        const bool alike = states.columns == rows.state_dim && actions.columns == rows.action_dim;
+        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
+                states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
+                " and ", rows.action_dim, " columns");
         const auto column = [&](const char* name) -> const Hdf5Dataset& {
             return table_of(file, group + name, steps, 1).data;
         };
-        const std::vector<float> all = file.read_floats(states.data);
+        const std::vector<float> all = file.read<float>(states.data);
         append(rows.observations, std::span(all).first(steps * rows.state_dim));
         append(rows.next_observations, std::span(all).last(steps * rows.state_dim));
-        append(rows.actions, file.read_floats(actions.data));
-        append(rows.rewards, file.read_floats(column("rewards")));
+        append(rows.actions, file.read<float>(actions.data));
+        append(rows.rewards, file.read<float>(column("rewards")));
         append(rows.terminals, file.read_flags(column("terminations")));
         append(rows.timeouts, file.read_flags(column("truncations")));
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
@@ -261,7 +257,7 @@ inline bool is_hdf5(const std::string& path) {
 // From rows to trajectories
 
 // Returns the given rows as a trajectory, in vectors without room to spare: a data set is large.
-inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& which, bool terminated) {
+inline Trajectory trajectory_of(const Rows& rows, std::span<const size_t> which) {
     Trajectory trajectory;
     trajectory.states.reserve(which.size() * rows.state_dim);
     trajectory.actions.reserve(which.size() * rows.action_dim);
@@ -272,8 +268,20 @@ inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& whi
         trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
         trajectory.rewards.push_back(rows.rewards[row]);
     }
-    trajectory.terminated = terminated;
+    trajectory.terminated = rows.terminals[which.back()] != 0;
     return trajectory;
+}
+
+// Returns the trajectories that rows `which` make: one ends with row which[i] where ends(i) holds. What follows the last
+// end is none.
+inline std::vector<Trajectory> cut(const Rows& rows, const std::vector<size_t>& which, const auto& ends) {
+    std::vector<Trajectory> trajectories;
+    for (size_t begin = 0, i = 0; i < which.size(); ++i) {
+        if (!ends(i)) continue;
+        trajectories.push_back(trajectory_of(rows, std::span(which).subspan(begin, i + 1 - begin)));
+        begin = i + 1;
+    }
+    return trajectories;
 }
 
 // Returns the timeouts; of a file without them (the first versions) a flag for every `limit`-th step of an episode.
@@ -295,15 +303,9 @@ inline std::vector<uint8_t> timeouts_of(const Rows& rows, size_t limit) {
 //   next row starts where this one ended. So the highest returns belong to trajectories that leave the rewarded goal.
 inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
     const std::vector<uint8_t> timeouts = timeouts_of(rows, limit);
-    std::vector<Trajectory> trajectories;
-    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
-    for (size_t row = 0; row < rows.count; ++row) {
-        open.push_back(row);
-        if (rows.terminals[row] == 0 && timeouts[row] == 0) continue;
-        trajectories.push_back(trajectory_of(rows, open, rows.terminals[row] != 0));
-        open.clear();
-    }
-    return trajectories;
+    std::vector<size_t> all(rows.count);
+    std::iota(all.begin(), all.end(), size_t{0});
+    return cut(rows, all, [&](size_t row) { return rows.terminals[row] != 0 || timeouts[row] != 0; });
 }
 
 // ODT's code for antmaze: it makes D4RL's Q-learning tuples (s_t, a_t, r_t, s_{t+1} = the next row), leaving out rows
@@ -323,51 +325,45 @@ inline std::vector<Trajectory> cut_tuples(const Rows& rows, size_t limit) {
         }
         return squared <= 1e-12;  // 1e-6 in norm
     };
-    std::vector<Trajectory> trajectories;
-    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
-    for (size_t i = 0; i < tuples.size(); ++i) {
-        open.push_back(tuples[i]);
-        const bool terminal = rows.terminals[tuples[i]] != 0;
-        if (!terminal && i + 1 < tuples.size() && continues(tuples[i], tuples[i + 1])) continue;
-        trajectories.push_back(trajectory_of(rows, open, terminal));
-        open.clear();
-    }
-    return trajectories;
+    return cut(rows, tuples, [&](size_t i) {
+        return rows.terminals[tuples[i]] != 0 || i + 1 == tuples.size() || !continues(tuples[i], tuples[i + 1]);
+    });
 }
 
 // Returns a data set's trajectories by the rules of the task's family. Errors: dataset.task if the rows are not of this
 // task's size, dataset.empty.
 inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTask& task, const std::string& path) {
-    if (rows.state_dim != static_cast<size_t>(task.state_dim) ||
-        rows.action_dim != static_cast<size_t>(task.action_dim))
-        fail("dataset.task",
-             "%s: has %zu state and %zu action numbers a step; %s has %d and %d: is it of another task?", path.c_str(),
-             rows.state_dim, rows.action_dim, task.name, task.state_dim, task.action_dim);
+    const bool same =
+        std::cmp_equal(rows.state_dim, task.state_dim) && std::cmp_equal(rows.action_dim, task.action_dim);
+    require(same, "dataset.task", path, ": has ", rows.state_dim, " state and ", rows.action_dim,
+            " action numbers a step; ", task.name, " has ", task.state_dim, " and ", task.action_dim,
+            ": is it of another task?");
     const size_t limit = static_cast<size_t>(task.max_episode_steps);
     std::vector<Trajectory> trajectories =
         task.rules == Rules::antmaze ? cut_tuples(rows, limit) : cut_at_flags(rows, limit);
-    if (trajectories.empty())
-        fail("dataset.empty", "%s: no step is marked as the end of a trajectory, so there is none", path.c_str());
+    require(!trajectories.empty(), "dataset.empty", path,
+            ": no step is marked as the end of a trajectory, so there is none");
     return trajectories;
 }
 
 // Requires what a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding
 // error. Errors: dataset.not_finite, dataset.action with the row and the column.
 inline void require_sound(const Rows& rows, const std::string& path) {
-    const auto require = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
+    const auto require_all = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
         for (size_t i = 0; i < values.size(); ++i) {
             if (std::fabs(values[i]) <= bound) continue;  // never so for NaN
             const bool finite = std::isfinite(values[i]);
-            fail(finite ? "dataset.action" : "dataset.not_finite", "%s: \"%s\", row %zu, column %zu is %g; %s",
-                 path.c_str(), name, i / width, i % width, static_cast<double>(values[i]),
-                 finite ? "actions lie in [-1, 1]: is it of another task, or not scaled?"
-                        : "only finite numbers can be learned from");
+            const char* const why = finite ? "; actions lie in [-1, 1]: is it of another task, or not scaled?"
+                                           : "; only finite numbers can be learned from";
+            throw Error(
+                finite ? "dataset.action" : "dataset.not_finite",
+                text_of(path, ": \"", name, "\", row ", i / width, ", column ", i % width, " is ", values[i], why));
         }
     };
     constexpr float any = std::numeric_limits<float>::max();
-    require("observations", rows.observations, rows.state_dim, any);
-    require("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
-    require("rewards", rows.rewards, 1, any);
+    require_all("observations", rows.observations, rows.state_dim, any);
+    require_all("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
+    require_all("rewards", rows.rewards, 1, any);
 }
 
 // The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.
