@@ -13,10 +13,8 @@
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
 
-#include <filesystem>
-
 #include "../mujoco_env.hpp"
-#include "hdf5.hpp"
+#include "hdf5.hpp"  // and with it the standard headers
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -29,39 +27,35 @@ struct PublishedDataSet {
     const char* file;  // below the address
     size_t steps;      // rows
     int trajectories;  // complete ones
-    const char* sha256;
     double mean_return, deviation, high, low;
     const char* collected_in;  // what `wodtem collect` takes on one core, as measured
+    const char* sha256;        // "": not published
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
 constexpr std::array<PublishedDataSet, 13> published_data_sets{{
-    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186,
-     "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0", 1422.06, 378.95, 3222.36, 315.87, "1 minute"},
-    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041,
-     "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 467.30, 511.03, 3192.93, -1.44,
-     "85,000 updates of 5 ms"},
-    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 1190,
-     "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 2852.09, 1095.44, 4226.94, -6.61, "2 minutes"},
-    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 1093,
-     "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 682.70, 895.96, 4132.00, -50.20,
-     "250,000 updates of 5 ms"},
-    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 1000,
-     "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 4770.33, 355.75, 5309.38, -310.23, "1 minute"},
-    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 202,
-     "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 3093.29, 1680.69, 4985.14, -638.49,
-     "125,000 updates of 5 ms"},
-    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 1202,
-     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 3051.26, NAN, NAN, NAN, "4 minutes"},
-    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 485,
-     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 975.94, NAN, NAN, NAN,
-     "390,000 updates of 7 ms"},
+    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186, 1422.06, 378.95, 3222.36, 315.87,
+     "1 minute", "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0"},
+    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041, 467.30, 511.03, 3192.93,
+     -1.44, "85,000 updates of 5 ms", "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b"},
+    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 1190, 2852.09, 1095.44, 4226.94, -6.61,
+     "2 minutes", "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda"},
+    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 1093, 682.70, 895.96, 4132.00,
+     -50.20, "250,000 updates of 5 ms", "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db"},
+    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 1000, 4770.33, 355.75, 5309.38,
+     -310.23, "1 minute", "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0"},
+    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 202, 3093.29, 1680.69,
+     4985.14, -638.49, "125,000 updates of 5 ms", "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683"},
+    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 1202, 3051.26, NAN, NAN, NAN, "4 minutes",
+     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137"},
+    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 485, 975.94, NAN, NAN, NAN,
+     "390,000 updates of 7 ms", "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46"},
     {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
-     1000000, 0, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", NAN, NAN, NAN, NAN, "6 minutes"},
+     1000000, 0, NAN, NAN, NAN, NAN, "6 minutes", "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130"},
     {"antmaze-umaze-diverse-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_True_multigoal_True_sparse_fixed.hdf5",
-     1000000, 0, "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932", NAN, NAN, NAN, NAN, "6 minutes"},
-    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, "", NAN, NAN, NAN, NAN, "3 seconds"},
-    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, "", NAN, NAN, NAN, NAN, "8 seconds"},
-    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, "", NAN, NAN, NAN, NAN, "18 seconds"},
+     1000000, 0, NAN, NAN, NAN, NAN, "6 minutes", "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932"},
+    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, NAN, NAN, NAN, NAN, "3 seconds", ""},
+    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, NAN, NAN, NAN, NAN, "8 seconds", ""},
+    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, NAN, NAN, NAN, NAN, "18 seconds", ""},
 }};
 
 inline const PublishedDataSet* find_published(std::string_view id) {

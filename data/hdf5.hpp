@@ -364,13 +364,13 @@ void convert_elements(const Hdf5Element& element, Bytes from, T* to) {
 
 struct Hdf5Chunk {
     uint64_t address, size;  // where and how many bytes in the file
-    uint64_t place;          // in the grid of chunks, row-major
-    uint32_t skipped;        // bit i: filter i was not applied
+    uint32_t skipped = 0;    // bit i: filter i was not applied
+    Shape place = {};        // which one, in each dimension, of the data set's chunks; of data in one run: {}
 };
 
 enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
 
-// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has counts (2, 3); the last chunk of
+// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has 2 times 3; the last chunk of
 // each row hangs over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
 struct Hdf5Dataset {
     std::string path;         // "infos/qpos": no slash at the start
@@ -381,7 +381,6 @@ struct Hdf5Dataset {
 
     Hdf5Element element;
     Shape chunk;                           // extents of a chunk; of data in one run: the shape
-    Shape counts;                          // chunks in each dimension
     std::vector<Hdf5Filter> filters;       // in the order in which the writer applied them
     Bytes fill;                            // one element as stored; empty: zeros
     std::vector<Hdf5Chunk> chunks;         // those that exist
@@ -448,7 +447,7 @@ struct Hdf5File {
             if (dataset.chunk == dataset.shape)
                 convert_elements(element, data, out.data());
             else
-                convert_chunk(dataset, chunk.place, data, out.data());
+                convert_chunk(dataset, chunk.place, data, out.data(), out.size());
         }
         return out;
     }
@@ -493,26 +492,17 @@ struct Hdf5File {
         return out;
     }
 
-    // Converts the part of a chunk that lies within the data set, row after row of the last dimension.
+    // Converts the part of a chunk that lies within the data set: of its dimensions from k on, with `size` elements in
+    // all, to the array that begins at `out`.
     template <class T>
-    static void convert_chunk(const Hdf5Dataset& dataset, uint64_t place, Bytes data, T* out) {
-        const Shape &shape = dataset.shape, &chunk = dataset.chunk;
-        Shape start(shape.size());  // of the chunk's first element in the data set
-        for (size_t k = start.size(); k-- > 0; place /= dataset.counts[k])
-            start[k] = place % dataset.counts[k] * chunk[k];
-        const size_t size = dataset.element.size, width = chunk.back() * size;
-        const size_t within = std::min(chunk.back(), shape.back() - start.back()) * size;
-        for (size_t row = 0; row < data.size() / width; ++row) {
-            size_t rest = row, to = start.back(), stride = shape.back();
-            bool inside = true;
-            for (size_t k = shape.size() - 1; k-- > 0; rest /= chunk[k]) {
-                const size_t index = start[k] + rest % chunk[k];
-                inside = inside && index < shape[k];
-                to += index * stride;
-                stride *= shape[k];
-            }
-            if (inside) convert_elements(dataset.element, data.subspan(row * width, within), out + to);
-        }
+    static void convert_chunk(const Hdf5Dataset& dataset, const Shape& place, Bytes data, T* out, size_t size,
+                              size_t k = 0) {
+        const size_t extent = dataset.shape[k], in_chunk = dataset.chunk[k], start = place[k] * in_chunk;
+        const size_t inside = std::min(in_chunk, extent - start), row = data.size() / in_chunk, stride = size / extent;
+        out += start * stride;
+        if (k + 1 == place.size()) return convert_elements(dataset.element, data.first(inside * row), out);
+        for (size_t i = 0; i < inside; ++i)
+            convert_chunk(dataset, place, data.subspan(i * row, row), out + i * stride, stride, k + 1);
     }
 };
 
@@ -967,6 +957,7 @@ struct Hdf5Parser {
     // A data set in the making, and what is read of its header but not kept.
     struct Grid : Hdf5Dataset {
         Shape most;                // the extents to which the data set may grow; ~0: without limit
+        Shape counts;              // chunks in each dimension
         uint64_t all = 1;          // chunks
         bool whole_edges = false;  // chunks that hang over the edge are not filtered
         // Arrays number the chunks row-major, by `most`; if one dimension is unlimited, it counts slowest, whichever it
@@ -1117,7 +1108,7 @@ struct Hdf5Parser {
         const uint64_t address = kind == 0 ? c.at : elsewhere;
         if (total == 0 || address == undefined_address) return;
         c.expect(size >= total, std::to_string(total) + " bytes of data");
-        add(g, {}, {address, total, 0, 0}, c.start);
+        add(g, {address, total}, c.start);
     }
 
     // Returns count * size, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are
@@ -1149,17 +1140,17 @@ struct Hdf5Parser {
         bounded(g.all, g.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
         if (g.elements == 0) return;
-        Shape place(rank);
         if (version == 3 && tree == undefined_address) return;
         if (version == 3)
-            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t chunk) {
+            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t address) {
                 const auto [size, skipped] = key.fields(4, 4);
+                Hdf5Chunk chunk{address, size, static_cast<uint32_t>(skipped)};
                 for (size_t k = 0; k < rank; ++k) {
                     const uint64_t first = key.number(8);
                     key.expect(first % g.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
-                    place[k] = first / g.chunk[k];
+                    chunk.place.push_back(first / g.chunk[k]);
                 }
-                add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
+                add(g, chunk, key.start);
             });
         const uint64_t index = c.number(1);
         c.expect(index >= 1 && index <= 5, "a chunk index of type 1 to 5");
@@ -1169,13 +1160,13 @@ struct Hdf5Parser {
         c.take(parameters[index]);
         const uint64_t address = c.number(8);
         if (address == undefined_address) return;
-        if (index == 1)
-            return add(g, place, {address, alone ? stored : g.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
+        const Hdf5Chunk single{address, alone ? stored : g.chunk_bytes, static_cast<uint32_t>(skipped), Shape(rank)};
+        if (index == 1) return add(g, single, c.start);
         if (index == 5)
             return b_tree_2(address, g.filters.empty() ? 10 : 11, [&](Cursor record) {
-                const Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
-                for (uint64_t& coordinate : place) coordinate = record.number(8);
-                add(g, place, chunk, record.start);
+                Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
+                for (size_t k = 0; k < rank; ++k) chunk.place.push_back(record.number(8));
+                add(g, chunk, record.start);
             });
         for (size_t k = 0; k < rank; ++k)
             g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
@@ -1188,14 +1179,13 @@ struct Hdf5Parser {
         if (index == 4) extensible_array(g);
     }
 
-    // `place`: which chunk, in each dimension. Those beyond the edge are left over from when the data set was larger.
-    void add(Grid& g, const Shape& place, Hdf5Chunk chunk, uint64_t offset) {
+    // Chunks beyond the edge are left over from when the data set was larger.
+    void add(Grid& g, Hdf5Chunk chunk, uint64_t offset) {
         if (chunk.address == undefined_address) return;
         bool partial = false;
-        for (size_t k = 0; k < place.size(); ++k) {
-            if (place[k] >= g.counts[k]) return;
-            chunk.place = chunk.place * g.counts[k] + place[k];
-            partial = partial || g.shape[k] - place[k] * g.chunk[k] < g.chunk[k];
+        for (size_t k = 0; k < chunk.place.size(); ++k) {
+            if (chunk.place[k] >= g.counts[k]) return;
+            partial = partial || g.shape[k] - chunk.place[k] * g.chunk[k] < g.chunk[k];
         }
         if (g.whole_edges && partial) chunk.skipped = ~0u;
         require_at(offset, g.chunks.size() < g.all, "hdf5.format", "each chunk once");
@@ -1210,7 +1200,7 @@ struct Hdf5Parser {
         const bool filtered = !g.filters.empty();
         c.expect(filtered ? size > 12 && size <= 20 : size == 8, "entries of 8 bytes, or with filters of 13 to 20");
         const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.chunk_bytes;
-        return {address, stored, 0, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
+        return {address, stored, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
     }
 
     static Shape place_of(const Grid& g, uint64_t number) {
@@ -1225,7 +1215,7 @@ struct Hdf5Parser {
         for (size_t k = 0; k < g.step.size(); ++k) last += product(g.counts[g.order[k]] - 1, g.step[k], g.index);
         require_inside(g.index, product(last + 1, g.chunk_bytes, g.index));
         for (uint64_t number = 0; number <= last; ++number)
-            add(g, place_of(g, number), {g.index + number * g.chunk_bytes, g.chunk_bytes, 0, 0}, g.index);
+            add(g, {g.index + number * g.chunk_bytes, g.chunk_bytes, 0, place_of(g, number)}, g.index);
     }
 
     // The index is an array of entries, numbered from 0. Its header and blocks (SPEC VII.C and D) begin alike:
@@ -1241,8 +1231,9 @@ struct Hdf5Parser {
 
     void entries(Grid& g, Cursor& c, uint64_t first, uint64_t count) {
         for (uint64_t number = first; number < first + count; ++number) {
-            const Hdf5Chunk chunk = index_entry(g, c, g.entry_size);
-            add(g, place_of(g, number), chunk, c.start);
+            Hdf5Chunk chunk = index_entry(g, c, g.entry_size);
+            chunk.place = place_of(g, number);
+            add(g, chunk, c.start);
         }
     }
 

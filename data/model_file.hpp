@@ -9,8 +9,6 @@
 // and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
 #pragma once
 
-#include <filesystem>
-
 #include "safetensors.hpp"
 #include "settings.hpp"  // and with it the other standard headers
 

@@ -16,16 +16,10 @@
 
 #include <sys/file.h>
 
-#include <array>
-#include <cerrno>
-#include <cstdio>
-#include <cstring>
-#include <filesystem>
-
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
 #include "console.hpp"
-#include "safetensors.hpp"
+#include "safetensors.hpp"  // and with it the standard headers
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
