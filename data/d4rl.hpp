@@ -59,9 +59,8 @@ constexpr std::array<PublishedDataSet, 13> published_data_sets{{
 }};
 
 inline const PublishedDataSet* find_published(std::string_view id) {
-    for (const PublishedDataSet& set : published_data_sets)
-        if (id == set.id) return &set;
-    return nullptr;
+    const auto found = std::ranges::find(published_data_sets, id, &PublishedDataSet::id);
+    return found == published_data_sets.end() ? nullptr : &*found;
 }
 
 // Returns the mean return of a gym task's medium set.
@@ -120,17 +119,22 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
                           std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
     const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
-    require(found || std::ranges::none_of(file.datasets, below), "dataset.shape", file.path, ": \"", name,
-            "\" is a group; write one table of numbers instead");
+    const bool is_group = !found && std::ranges::any_of(file.datasets, below);
+    require(!is_group, "dataset.shape", file.path, ": \"", name, "\" is a group; write one table of numbers instead");
     require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
     const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
     const bool table = shape.size() == 1 || shape.size() == 2;
-    require(table && shape[0] == rows.value_or(shape[0]) && width == columns.value_or(width), "dataset.shape",
-            file.path, ": \"", name, "\" has shape ", shape_text(shape), ", expected ", text(rows), " by ",
-            text(columns));
+    const bool fits = table && shape[0] == rows.value_or(shape[0]) && width == columns.value_or(width);
+    require(fits, "dataset.shape", file.path, ": \"", name, "\" has shape ", shape_text(shape), ", expected ",
+            text(rows), " by ", text(columns));
     return {*found, shape[0], width};
+}
+
+// Returns a data set of so many rows and one column. Errors: dataset.shape.
+inline const Hdf5Dataset& column_of(const Hdf5File& file, const std::string& name, uint64_t rows) {
+    return table_of(file, name, rows, 1).data;
 }
 
 // Refuses a column that is neither D4RL's nor d3rlpy's: it may mark the ends of episodes. Errors: dataset.column.
@@ -141,8 +145,7 @@ inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std
         const Hdf5Dataset* column = file.find(name);
         require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column", file.path, ": \"", name,
                 "\" has a row for each step and is not read beside ", ends,
-                "; name what marks the ends of episodes "
-                "timeouts, and move the rest to a group such as infos");
+                "; name what marks the ends of episodes timeouts, and move the rest to a group such as infos");
     }
 }
 
@@ -155,18 +158,15 @@ inline Rows read_rows(const Hdf5File& file) {
     rows.action_dim = actions.columns;
     const bool empty = rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0;
     require(!empty, "dataset.shape", file.path, ": holds no steps");
-    const auto column = [&](const char* name) -> const Hdf5Dataset& {
-        return table_of(file, name, rows.count, 1).data;
-    };
     rows.observations = file.read<float>(states.data);
     rows.actions = file.read<float>(actions.data);
-    rows.rewards = file.read<float>(column("rewards"));
-    rows.terminals = file.read_flags(column("terminals"));
-    const std::string ends =
-        file.find("episode_terminals") && !file.find("timeouts") ? "episode_terminals" : "timeouts";
+    rows.rewards = file.read<float>(column_of(file, "rewards", rows.count));
+    rows.terminals = file.read_flags(column_of(file, "terminals", rows.count));
+    const bool of_d3rlpy = file.find("episode_terminals") && !file.find("timeouts");
+    const std::string ends = of_d3rlpy ? "episode_terminals" : "timeouts";
     require_known_columns(file, rows.count, ends);
-    if (file.find(ends)) rows.timeouts = file.read_flags(column(ends.c_str()));
-    if (ends == "episode_terminals")  // also set where the task ended the episode, which is no timeout
+    if (file.find(ends)) rows.timeouts = file.read_flags(column_of(file, ends, rows.count));
+    if (of_d3rlpy)  // also set where the task ended the episode, which is no timeout
         for (size_t row = 0; row < rows.count; ++row) rows.timeouts[row] &= rows.terminals[row] == 0;
     if (file.find("next_observations"))
         rows.next_observations = file.read<float>(table_of(file, "next_observations", rows.count, rows.state_dim).data);
@@ -219,16 +219,13 @@ inline Rows read_minari(const Hdf5File& file) {
         require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
                 states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
                 " and ", rows.action_dim, " columns");
-        const auto column = [&](const char* name) -> const Hdf5Dataset& {
-            return table_of(file, group + name, steps, 1).data;
-        };
         const std::vector<float> all = file.read<float>(states.data);
         append(rows.observations, std::span(all).first(steps * rows.state_dim));
         append(rows.next_observations, std::span(all).last(steps * rows.state_dim));
         append(rows.actions, file.read<float>(actions.data));
-        append(rows.rewards, file.read<float>(column("rewards")));
-        append(rows.terminals, file.read_flags(column("terminations")));
-        append(rows.timeouts, file.read_flags(column("truncations")));
+        append(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
+        append(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
+        append(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
@@ -252,16 +249,14 @@ inline bool is_hdf5(const std::string& path) {
 
 // Returns the given rows as a trajectory, in vectors without room to spare: a data set is large.
 inline Trajectory trajectory_of(const Rows& rows, std::span<const size_t> which) {
+    const auto gather = [&](std::vector<float>& to, const std::vector<float>& from, size_t width) {
+        to.reserve(which.size() * width);
+        for (const size_t row : which) to.insert(to.end(), &from[row * width], &from[row * width] + width);
+    };
     Trajectory trajectory;
-    trajectory.states.reserve(which.size() * rows.state_dim);
-    trajectory.actions.reserve(which.size() * rows.action_dim);
-    trajectory.rewards.reserve(which.size());
-    for (const size_t row : which) {
-        const float *state = rows.observation(row), *action = &rows.actions[row * rows.action_dim];
-        trajectory.states.insert(trajectory.states.end(), state, state + rows.state_dim);
-        trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
-        trajectory.rewards.push_back(rows.rewards[row]);
-    }
+    gather(trajectory.states, rows.observations, rows.state_dim);
+    gather(trajectory.actions, rows.actions, rows.action_dim);
+    gather(trajectory.rewards, rows.rewards, 1);
     trajectory.terminated = rows.terminals[which.back()] != 0;
     return trajectory;
 }
@@ -327,11 +322,10 @@ inline std::vector<Trajectory> cut_tuples(const Rows& rows, size_t limit) {
 // Returns a data set's trajectories by the rules of the task's family. Errors: dataset.task if the rows are not of this
 // task's size, dataset.empty.
 inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTask& task, const std::string& path) {
-    const bool same =
-        std::cmp_equal(rows.state_dim, task.state_dim) && std::cmp_equal(rows.action_dim, task.action_dim);
-    require(same, "dataset.task", path, ": has ", rows.state_dim, " state and ", rows.action_dim,
-            " action numbers a step; ", task.name, " has ", task.state_dim, " and ", task.action_dim,
-            ": is it of another task?");
+    const size_t state_dim = task.state_dim, action_dim = task.action_dim;
+    require(rows.state_dim == state_dim && rows.action_dim == action_dim, "dataset.task", path, ": has ",
+            rows.state_dim, " state and ", rows.action_dim, " action numbers a step; ", task.name, " has ", state_dim,
+            " and ", action_dim, ": is it of another task?");
     const size_t limit = static_cast<size_t>(task.max_episode_steps);
     std::vector<Trajectory> trajectories =
         task.rules == Rules::antmaze ? cut_tuples(rows, limit) : cut_at_flags(rows, limit);
@@ -347,11 +341,11 @@ inline void require_sound(const Rows& rows, const std::string& path) {
         for (size_t i = 0; i < values.size(); ++i) {
             if (std::fabs(values[i]) <= bound) continue;  // never so for NaN
             const bool finite = std::isfinite(values[i]);
-            const char* const why = finite ? "; actions lie in [-1, 1]: is it of another task, or not scaled?"
-                                           : "; only finite numbers can be learned from";
-            throw Error(
-                finite ? "dataset.action" : "dataset.not_finite",
-                text_of(path, ": \"", name, "\", row ", i / width, ", column ", i % width, " is ", values[i], why));
+            const std::string found = text_of("\", row ", i / width, ", column ", i % width, " is ", values[i]);
+            require(!finite, "dataset.action", path, ": \"", name, found,
+                    "; actions lie in [-1, 1]: is it of another task, or not scaled?");
+            require(finite, "dataset.not_finite", path, ": \"", name, found,
+                    "; only finite numbers can be learned from");
         }
     };
     constexpr float any = std::numeric_limits<float>::max();

@@ -494,8 +494,7 @@ struct Hdf5File {
 
     // Converts the part of a chunk that lies within the data set: of its dimensions from k on, with `size` elements in
     // all, to the array that begins at `out`.
-    template <class T>
-    static void convert_chunk(const Hdf5Dataset& dataset, const Shape& place, Bytes data, T* out, size_t size,
+    static void convert_chunk(const Hdf5Dataset& dataset, const Shape& place, Bytes data, auto* out, size_t size,
                               size_t k = 0) {
         const size_t extent = dataset.shape[k], in_chunk = dataset.chunk[k], start = place[k] * in_chunk;
         const size_t inside = std::min(in_chunk, extent - start), row = data.size() / in_chunk, stride = size / extent;
@@ -1354,10 +1353,9 @@ class Hdf5Writer {
 
     // Elements, row-major: float, double, int32_t, or uint8_t for booleans (0 or 1).
     // Errors: hdf5.name, hdf5.shape, hdf5.flag, file.write.
-    template <std::ranges::contiguous_range Range>
-    void add(const std::string& name, const Shape& shape, const Range& range) {
+    void add(const std::string& name, const Shape& shape, const std::ranges::contiguous_range auto& range) {
         const std::span data(range);
-        using T = std::ranges::range_value_t<Range>;
+        using T = typename decltype(data)::value_type;
         if constexpr (std::is_same_v<T, uint8_t>) {
             const bool flags = std::ranges::none_of(data, [](uint8_t flag) { return flag > 1; });
             require(flags, "hdf5.flag", dataset_place(file_.path, name), "a flag is neither 0 nor 1");

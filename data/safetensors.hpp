@@ -365,10 +365,9 @@ struct TensorFile {
 
     // Copies `values` (vector, span or array; row-major) to the end. A scalar: add("step", {}, std::array{n}).
     // Errors: safetensors.name, safetensors.shape, safetensors.duplicate_name.
-    template <std::ranges::contiguous_range Values>
-    void add(const std::string& name, const Shape& shape, const Values& values) {
+    void add(const std::string& name, const Shape& shape, const std::ranges::contiguous_range auto& values) {
         const std::span given(std::ranges::data(values), std::ranges::size(values));
-        constexpr DType dtype = dtype_of<std::ranges::range_value_t<Values>>();
+        constexpr DType dtype = dtype_of<typename decltype(given)::value_type>();
         const std::string place = tensor_place(path, name);
         check_name(name, path);
         require(byte_size(shape, dtype) == given.size_bytes(), "safetensors.shape", place, ": has shape ",
@@ -437,8 +436,7 @@ inline std::string file_start(const TensorFile& file) {
     for (const StoredTensor& tensor : file.tensors) {
         out += "," + json_string(tensor.name) + ":{\"dtype\":\"" + about(tensor.dtype).name + "\",\"shape\":[";
         for (size_t i = 0; i < tensor.shape.size(); ++i) out += (i > 0 ? "," : "") + std::to_string(tensor.shape[i]);
-        const size_t end = tensor.begin + tensor.size;
-        out += "],\"data_offsets\":[" + std::to_string(tensor.begin) + "," + std::to_string(end) + "]}";
+        out += text_of("],\"data_offsets\":[", tensor.begin, ",", tensor.begin + tensor.size, "]}");
     }
     out += "}";
     out.resize((out.size() + 7) / 8 * 8, ' ');
@@ -674,10 +672,7 @@ struct Saver {
     void operator()(const std::string& name, const std::vector<T>& values, std::optional<size_t> size = {}) {
         file.add(name, {size.value_or(values.size())}, values);
     }
-    template <class T>
-    void operator()(const std::string& name, const T& value) {
-        file.add(name, {}, std::array{value});
-    }
+    void operator()(const std::string& name, const auto& value) { file.add(name, {}, std::array{value}); }
 };
 
 // Errors: those of TensorFile::read_into.
