@@ -160,27 +160,21 @@ struct HuffmanCode {
     // lengths[s]: bits of the code of symbol s, at most 15; 0: no code. Returns false unless the code is complete, but
     // for one of a single bit or none at all (section 3.2.7).
     bool build(std::span<const uint8_t> lengths) {
-        std::array<uint32_t, 16> count{}, next{};
-        for (const uint8_t length : lengths) ++count[length];
-        uint32_t used = 0, longest = 0;  // `used`: share of all codes, in units of 2^-15
-        for (uint32_t length = 1; length < 16; ++length) {
-            next[length] = used >> (15 - length);
-            used += count[length] << (15 - length);
-            if (count[length] > 0) longest = length;
-        }
-        if (used != 0 && used != 1 << 15 && !(used == 1 << 14 && count[1] == 1)) return false;
+        const uint32_t longest = std::ranges::max(lengths);
         mask = (1u << longest) - 1;
         std::fill_n(entries.begin(), mask + 1, uint16_t{0});
-        for (size_t s = 0; s < lengths.size(); ++s) {
-            const uint32_t length = lengths[s];
-            if (length == 0) continue;
-            const uint32_t code = next[length]++;
-            uint32_t reversed = 0;
-            for (uint32_t bit = 0; bit < length; ++bit) reversed |= (code >> bit & 1) << (length - 1 - bit);
-            for (uint32_t i = reversed; i <= mask; i += 1u << length)
-                entries[i] = static_cast<uint16_t>(s << 4 | length);
-        }
-        return true;
+        uint32_t next = 0;  // the next code, in the highest of 15 bits; 2^15: none is left
+        for (uint32_t length = 1; length <= longest; ++length)
+            for (size_t s = 0; s < lengths.size(); ++s) {
+                if (lengths[s] != length) continue;
+                if (next >= 1 << 15) return false;
+                uint32_t reversed = 0;
+                for (uint32_t bit = 0; bit < length; ++bit) reversed |= (next >> (14 - bit) & 1) << bit;
+                for (uint32_t i = reversed; i <= mask; i += 1u << length)
+                    entries[i] = static_cast<uint16_t>(s << 4 | length);
+                next += 1u << (15 - length);
+            }
+        return next == 0 || next == 1 << 15 || longest == 1;
     }
 };
 
