@@ -259,9 +259,9 @@ struct Inflater {
         }
         if (lengths.size() > n_symbols + n_distances) bad_stream("more code lengths than codes");
         if (lengths[256] == 0) bad_stream("no code for the end of the block");
-        if (!symbols.build(std::span(lengths).first(n_symbols)) ||
-            !distances.build(std::span(lengths).last(n_distances)))
-            bad_stream("an invalid set of code lengths");
+        const std::span<const uint8_t> all(lengths);
+        const bool valid = symbols.build(all.first(n_symbols)) && distances.build(all.last(n_distances));
+        if (!valid) bad_stream("an invalid set of code lengths");
     }
 
     void compressed() {
@@ -577,9 +577,8 @@ struct Hdf5Parser {
         }
         uint64_t number(uint64_t size) { return little_endian(take(size)); }
         // Returns the next fields, given their sizes in bytes; one of more than 8 bytes is not needed here.
-        template <class... Sizes>
-        std::array<uint64_t, sizeof...(Sizes)> fields(Sizes... sizes) {
-            return {number(static_cast<uint64_t>(sizes))...};  // braces: from the first to the last
+        auto fields(auto... sizes) {
+            return std::array{number(static_cast<uint64_t>(sizes))...};  // braces: from the first to the last
         }
         void expect(bool holds, std::string_view what, const char* id = "hdf5.format") const {
             parser.require_at(start, holds, id, what);

@@ -686,8 +686,7 @@ struct Loader {
         values.resize(size.value_or(values.empty() ? stored : values.size()));
         file.read_into(std::span<T>(values), name, {values.size()});
     }
-    template <class T>
-    void operator()(const std::string& name, T& value) {
-        value = file.get<T>(name, {})[0];
+    void operator()(const std::string& name, auto& value) {
+        value = file.get<std::remove_reference_t<decltype(value)>>(name, {})[0];
     }
 };
