@@ -10,7 +10,6 @@
 // the rows.
 #pragma once
 
-#include <memory>
 #include <set>
 
 #include "safetensors.hpp"
