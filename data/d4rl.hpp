@@ -237,8 +237,8 @@ inline Rows read_data_set(const std::string& path) {
     return is_minari(file) ? read_minari(file) : read_rows(file);
 }
 
-// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock. Errors: those
-// of has_superblock().
+// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock.
+// Errors: those of has_superblock().
 inline bool is_hdf5(const std::string& path) {
     const std::filesystem::path extension = std::filesystem::path(path).extension();
     return extension == ".hdf5" || extension == ".h5" || has_superblock(path);
@@ -261,8 +261,8 @@ inline Trajectory trajectory_of(const Rows& rows, std::span<const size_t> which)
     return trajectory;
 }
 
-// Returns the trajectories that rows `which` make: one ends with row which[i] where ends(i) holds. What follows the last
-// end is none.
+// Returns the trajectories that the rows `which` make, one after the other: each ends with a row which[i] for which
+// ends(i) holds. Rows after the last end make none.
 inline std::vector<Trajectory> cut(const Rows& rows, const std::vector<size_t>& which, const auto& ends) {
     std::vector<Trajectory> trajectories;
     for (size_t begin = 0, i = 0; i < which.size(); ++i) {

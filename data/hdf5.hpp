@@ -541,6 +541,7 @@ struct Hdf5Parser {
     std::string object = "superblock";  // being read, for messages
     std::set<uint64_t> groups = {};     // addresses already visited
 
+    // Fails with what was expected at this offset, unless the condition holds.
     void require_at(uint64_t offset, bool holds, const char* id, const auto&... expected) const {
         require(holds, id, file.path, ": ", object, ": offset ", offset, ": expected ", expected...,
                 "; the file is damaged or of a kind unknown to this reader");
@@ -1194,6 +1195,7 @@ struct Hdf5Parser {
         return {address, stored, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
     }
 
+    // Returns the place of the chunk that has this number in an array.
     static Shape place_of(const Grid& g, uint64_t number) {
         Shape place(g.order.size());
         for (size_t k = 0; k < place.size(); number %= g.step[k++]) place[g.order[k]] = number / g.step[k];
@@ -1202,7 +1204,7 @@ struct Hdf5Parser {
 
     // SPEC VII.B: chunk after chunk, without an index.
     void implicit_index(Grid& g) {
-        uint64_t last = 0;
+        uint64_t last = 0;  // number of the last chunk of the data set
         for (size_t k = 0; k < g.step.size(); ++k) last += product(g.counts[g.order[k]] - 1, g.step[k], g.index);
         require_inside(g.index, product(last + 1, g.chunk_bytes, g.index));
         for (uint64_t number = 0; number <= last; ++number)
@@ -1467,7 +1469,7 @@ class Hdf5Writer {
         const size_t count = node.children.size();
         entries.resize(2 * leaf_k_ * 40);
         const uint64_t segment = place(names);
-        const std::string heap_sizes = little(names.size(), 8) + little(1, 8);  // of all, of what is free: none
+        const std::string heap_sizes = little(names.size(), 8) + little(1, 8);  // of the names; 1: nothing is free
         const uint64_t heap = place("HEAP" + little(0, 4) + heap_sizes + little(segment, 8));
         const uint64_t leaf = place("SNOD" + little(1, 2) + little(count, 2) + entries);
         std::string keys = little(0, 8) + little(leaf, 8) + little(last_name, 8);
