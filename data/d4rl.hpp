@@ -13,10 +13,8 @@
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
 
-#include <filesystem>
-
 #include "../mujoco_env.hpp"
-#include "hdf5.hpp"
+#include "hdf5.hpp"  // and with it the standard headers
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -29,45 +27,40 @@ struct PublishedDataSet {
     const char* file;  // below the address
     size_t steps;      // rows
     int trajectories;  // complete ones
-    const char* sha256;
     double mean_return, deviation, high, low;
     const char* collected_in;  // what `wodtem collect` takes on one core, as measured
+    const char* sha256;        // "": not published
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
 constexpr std::array<PublishedDataSet, 13> published_data_sets{{
-    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186,
-     "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0", 1422.06, 378.95, 3222.36, 315.87, "1 minute"},
-    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041,
-     "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b", 467.30, 511.03, 3192.93, -1.44,
-     "85,000 updates of 5 ms"},
-    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 1190,
-     "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda", 2852.09, 1095.44, 4226.94, -6.61, "2 minutes"},
-    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 1093,
-     "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db", 682.70, 895.96, 4132.00, -50.20,
-     "250,000 updates of 5 ms"},
-    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 1000,
-     "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0", 4770.33, 355.75, 5309.38, -310.23, "1 minute"},
-    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 202,
-     "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683", 3093.29, 1680.69, 4985.14, -638.49,
-     "125,000 updates of 5 ms"},
-    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 1202,
-     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137", 3051.26, NAN, NAN, NAN, "4 minutes"},
-    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 485,
-     "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46", 975.94, NAN, NAN, NAN,
-     "390,000 updates of 7 ms"},
+    {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186, 1422.06, 378.95, 3222.36, 315.87,
+     "1 minute", "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0"},
+    {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041, 467.30, 511.03, 3192.93,
+     -1.44, "85,000 updates of 5 ms", "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b"},
+    {"walker2d-medium-v2", "gym_mujoco_v2/walker2d_medium-v2.hdf5", 1000000, 1190, 2852.09, 1095.44, 4226.94, -6.61,
+     "2 minutes", "cf00f43add04c17fdfc2958dd581dea0851b2e5bedbe6fda073758a8f841aeda"},
+    {"walker2d-medium-replay-v2", "gym_mujoco_v2/walker2d_medium_replay-v2.hdf5", 302000, 1093, 682.70, 895.96, 4132.00,
+     -50.20, "250,000 updates of 5 ms", "e75de96a4f77acf7d4e0d6fdf0d7ccb177c26c44bb4388e4fd99f543ccfa18db"},
+    {"halfcheetah-medium-v2", "gym_mujoco_v2/halfcheetah_medium-v2.hdf5", 1000000, 1000, 4770.33, 355.75, 5309.38,
+     -310.23, "1 minute", "41324e8487a9556d8cfa4538827f8937f4d63dae3030825ebc9f3a726ed08ca0"},
+    {"halfcheetah-medium-replay-v2", "gym_mujoco_v2/halfcheetah_medium_replay-v2.hdf5", 202000, 202, 3093.29, 1680.69,
+     4985.14, -638.49, "125,000 updates of 5 ms", "48d494a4770c11f48260736dec090b78bdca8375647ed4d24bfa5b6610c7f683"},
+    {"ant-medium-v2", "gym_mujoco_v2/ant_medium-v2.hdf5", 1000000, 1202, 3051.26, NAN, NAN, NAN, "4 minutes",
+     "461c03b9f70f40d66b47608a92965e4ef3642bd9cdb1320d10acc92754167137"},
+    {"ant-medium-replay-v2", "gym_mujoco_v2/ant_medium_replay-v2.hdf5", 302000, 485, 975.94, NAN, NAN, NAN,
+     "390,000 updates of 7 ms", "844c4e5743ef51091f2106a3570b257fb149032c4743f8a5f02f40adc3b42a46"},
     {"antmaze-umaze-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse_fixed.hdf5",
-     1000000, 0, "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130", NAN, NAN, NAN, NAN, "6 minutes"},
+     1000000, 0, NAN, NAN, NAN, NAN, "6 minutes", "5ef15257771c50ef4d23c7de001750e96c8bb5d9b6a5e4a821dcfb3065fbd130"},
     {"antmaze-umaze-diverse-v2", "ant_maze_v2/Ant_maze_u-maze_noisy_multistart_True_multigoal_True_sparse_fixed.hdf5",
-     1000000, 0, "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932", NAN, NAN, NAN, NAN, "6 minutes"},
-    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, "", NAN, NAN, NAN, NAN, "3 seconds"},
-    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, "", NAN, NAN, NAN, NAN, "8 seconds"},
-    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, "", NAN, NAN, NAN, NAN, "18 seconds"},
+     1000000, 0, NAN, NAN, NAN, NAN, "6 minutes", "c771dd63963cd7d9f55f24a6d809064f6b82250a6aeac4c9d13f9a1d06e8c932"},
+    {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, NAN, NAN, NAN, NAN, "3 seconds", ""},
+    {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, NAN, NAN, NAN, NAN, "8 seconds", ""},
+    {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, NAN, NAN, NAN, NAN, "18 seconds", ""},
 }};
 
 inline const PublishedDataSet* find_published(std::string_view id) {
-    for (const PublishedDataSet& set : published_data_sets)
-        if (id == set.id) return &set;
-    return nullptr;
+    const auto found = std::ranges::find(published_data_sets, id, &PublishedDataSet::id);
+    return found == published_data_sets.end() ? nullptr : &*found;
 }
 
 // Returns the mean return of a gym task's medium set.
@@ -126,17 +119,22 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
                           std::optional<uint64_t> columns = {}) {
     const Hdf5Dataset* found = file.find(name);
     const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
-    if (!found && std::ranges::any_of(file.datasets, below))
-        throw Error("dataset.shape", file.path + ": \"" + name + "\" is a group; write one table of numbers instead");
-    if (!found)
-        throw Error("dataset.shape", file.path + ": has no data set \"" + name + "\"; it is not in D4RL's layout");
+    const bool is_group = !found && std::ranges::any_of(file.datasets, below);
+    require(!is_group, "dataset.shape", file.path, ": \"", name, "\" is a group; write one table of numbers instead");
+    require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
     const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
-    if (shape.empty() || shape.size() > 2 || shape[0] != rows.value_or(shape[0]) || width != columns.value_or(width))
-        throw Error("dataset.shape", file.path + ": \"" + name + "\" has shape " + shape_text(shape) + ", expected " +
-                                         text(rows) + " by " + text(columns));
+    const bool table = shape.size() == 1 || shape.size() == 2;
+    const bool fits = table && shape[0] == rows.value_or(shape[0]) && width == columns.value_or(width);
+    require(fits, "dataset.shape", file.path, ": \"", name, "\" has shape ", shape_text(shape), ", expected ",
+            text(rows), " by ", text(columns));
     return {*found, shape[0], width};
+}
+
+// Returns a data set of so many rows and one column. Errors: dataset.shape.
+inline const Hdf5Dataset& column_of(const Hdf5File& file, const std::string& name, uint64_t rows) {
+    return table_of(file, name, rows, 1).data;
 }
 
 // Refuses a column that is neither D4RL's nor d3rlpy's: it may mark the ends of episodes. Errors: dataset.column.
@@ -145,11 +143,9 @@ inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std
         const std::set<std::string> known = {"observations", "actions", "rewards", "terminals", "next_observations"};
         if (name.find('/') != std::string::npos || known.contains(name) || name == ends) continue;
         const Hdf5Dataset* column = file.find(name);
-        if (column && !column->shape.empty() && column->shape[0] == rows)
-            fail("dataset.column",
-                 "%s: \"%s\" has a row for each step and is not read beside %s; name what marks the ends of episodes "
-                 "timeouts, and move the rest to a group such as infos",
-                 file.path.c_str(), name.c_str(), ends.c_str());
+        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column", file.path, ": \"", name,
+                "\" has a row for each step and is not read beside ", ends,
+                "; name what marks the ends of episodes timeouts, and move the rest to a group such as infos");
     }
 }
 
@@ -160,23 +156,20 @@ inline Rows read_rows(const Hdf5File& file) {
     rows.count = states.rows;
     rows.state_dim = states.columns;
     rows.action_dim = actions.columns;
-    if (rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0)
-        fail("dataset.shape", "%s: holds no steps", file.path.c_str());
-    const auto column = [&](const char* name) -> const Hdf5Dataset& {
-        return table_of(file, name, rows.count, 1).data;
-    };
-    rows.observations = file.read_floats(states.data);
-    rows.actions = file.read_floats(actions.data);
-    rows.rewards = file.read_floats(column("rewards"));
-    rows.terminals = file.read_flags(column("terminals"));
-    const std::string ends =
-        file.find("episode_terminals") && !file.find("timeouts") ? "episode_terminals" : "timeouts";
+    const bool empty = rows.count == 0 || rows.state_dim == 0 || rows.action_dim == 0;
+    require(!empty, "dataset.shape", file.path, ": holds no steps");
+    rows.observations = file.read<float>(states.data);
+    rows.actions = file.read<float>(actions.data);
+    rows.rewards = file.read<float>(column_of(file, "rewards", rows.count));
+    rows.terminals = file.read_flags(column_of(file, "terminals", rows.count));
+    const bool of_d3rlpy = file.find("episode_terminals") && !file.find("timeouts");
+    const std::string ends = of_d3rlpy ? "episode_terminals" : "timeouts";
     require_known_columns(file, rows.count, ends);
-    if (file.find(ends)) rows.timeouts = file.read_flags(column(ends.c_str()));
-    if (ends == "episode_terminals")  // also set where the task ended the episode, which is no timeout
+    if (file.find(ends)) rows.timeouts = file.read_flags(column_of(file, ends, rows.count));
+    if (of_d3rlpy)  // also set where the task ended the episode, which is no timeout
         for (size_t row = 0; row < rows.count; ++row) rows.timeouts[row] &= rows.terminals[row] == 0;
     if (file.find("next_observations"))
-        rows.next_observations = file.read_floats(table_of(file, "next_observations", rows.count, rows.state_dim).data);
+        rows.next_observations = file.read<float>(table_of(file, "next_observations", rows.count, rows.state_dim).data);
     return rows;
 }
 
@@ -198,9 +191,8 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     std::set<uint64_t> episodes;
     for (const std::string& name : file.names()) {
         const std::optional<uint64_t> episode = minari_episode(name);
-        if (!episode)
-            fail("dataset.column", "%s: \"%s\" lies in none of Minari's groups episode_0, episode_1, ...",
-                 file.path.c_str(), name.c_str());
+        require(episode.has_value(), "dataset.column", file.path, ": \"", name,
+                "\" lies in none of Minari's groups episode_0, episode_1, ...");
         episodes.insert(*episode);
     }
     const auto stated = file.attributes.find("total_episodes");
@@ -223,22 +215,17 @@ inline Rows read_minari(const Hdf5File& file) {
         if (rows.count == 0) rows.state_dim = states.columns;
         if (rows.count == 0) rows.action_dim = actions.columns;
         const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
-        if (states.columns != rows.state_dim || actions.columns != rows.action_dim || empty)
-            fail(
-                "dataset.shape",
-                "%s: %sobservations and actions have %zu and %zu columns, %zu steps; the first has %zu and %zu columns",
-                file.path.c_str(), group.c_str(), size_t{states.columns}, size_t{actions.columns}, size_t{steps},
-                rows.state_dim, rows.action_dim);
-        const auto column = [&](const char* name) -> const Hdf5Dataset& {
-            return table_of(file, group + name, steps, 1).data;
-        };
-        const std::vector<float> all = file.read_floats(states.data);
+        const bool alike = states.columns == rows.state_dim && actions.columns == rows.action_dim;
+        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
+                states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
+                " and ", rows.action_dim, " columns");
+        const std::vector<float> all = file.read<float>(states.data);
         append(rows.observations, std::span(all).first(steps * rows.state_dim));
         append(rows.next_observations, std::span(all).last(steps * rows.state_dim));
-        append(rows.actions, file.read_floats(actions.data));
-        append(rows.rewards, file.read_floats(column("rewards")));
-        append(rows.terminals, file.read_flags(column("terminations")));
-        append(rows.timeouts, file.read_flags(column("truncations")));
+        append(rows.actions, file.read<float>(actions.data));
+        append(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
+        append(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
+        append(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
@@ -250,8 +237,8 @@ inline Rows read_data_set(const std::string& path) {
     return is_minari(file) ? read_minari(file) : read_rows(file);
 }
 
-// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock. Errors: those
-// of has_superblock().
+// True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock.
+// Errors: those of has_superblock().
 inline bool is_hdf5(const std::string& path) {
     const std::filesystem::path extension = std::filesystem::path(path).extension();
     return extension == ".hdf5" || extension == ".h5" || has_superblock(path);
@@ -261,19 +248,29 @@ inline bool is_hdf5(const std::string& path) {
 // From rows to trajectories
 
 // Returns the given rows as a trajectory, in vectors without room to spare: a data set is large.
-inline Trajectory trajectory_of(const Rows& rows, const std::vector<size_t>& which, bool terminated) {
+inline Trajectory trajectory_of(const Rows& rows, std::span<const size_t> which) {
+    const auto gather = [&](std::vector<float>& to, const std::vector<float>& from, size_t width) {
+        to.reserve(which.size() * width);
+        for (const size_t row : which) to.insert(to.end(), &from[row * width], &from[row * width] + width);
+    };
     Trajectory trajectory;
-    trajectory.states.reserve(which.size() * rows.state_dim);
-    trajectory.actions.reserve(which.size() * rows.action_dim);
-    trajectory.rewards.reserve(which.size());
-    for (const size_t row : which) {
-        const float *state = rows.observation(row), *action = &rows.actions[row * rows.action_dim];
-        trajectory.states.insert(trajectory.states.end(), state, state + rows.state_dim);
-        trajectory.actions.insert(trajectory.actions.end(), action, action + rows.action_dim);
-        trajectory.rewards.push_back(rows.rewards[row]);
-    }
-    trajectory.terminated = terminated;
+    gather(trajectory.states, rows.observations, rows.state_dim);
+    gather(trajectory.actions, rows.actions, rows.action_dim);
+    gather(trajectory.rewards, rows.rewards, 1);
+    trajectory.terminated = rows.terminals[which.back()] != 0;
     return trajectory;
+}
+
+// Returns the trajectories that the rows `which` make, one after the other: each ends with a row which[i] for which
+// ends(i) holds. Rows after the last end make none.
+inline std::vector<Trajectory> cut(const Rows& rows, const std::vector<size_t>& which, const auto& ends) {
+    std::vector<Trajectory> trajectories;
+    for (size_t begin = 0, i = 0; i < which.size(); ++i) {
+        if (!ends(i)) continue;
+        trajectories.push_back(trajectory_of(rows, std::span(which).subspan(begin, i + 1 - begin)));
+        begin = i + 1;
+    }
+    return trajectories;
 }
 
 // Returns the timeouts; of a file without them (the first versions) a flag for every `limit`-th step of an episode.
@@ -295,15 +292,9 @@ inline std::vector<uint8_t> timeouts_of(const Rows& rows, size_t limit) {
 //   next row starts where this one ended. So the highest returns belong to trajectories that leave the rewarded goal.
 inline std::vector<Trajectory> cut_at_flags(const Rows& rows, size_t limit) {
     const std::vector<uint8_t> timeouts = timeouts_of(rows, limit);
-    std::vector<Trajectory> trajectories;
-    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
-    for (size_t row = 0; row < rows.count; ++row) {
-        open.push_back(row);
-        if (rows.terminals[row] == 0 && timeouts[row] == 0) continue;
-        trajectories.push_back(trajectory_of(rows, open, rows.terminals[row] != 0));
-        open.clear();
-    }
-    return trajectories;
+    std::vector<size_t> all(rows.count);
+    std::iota(all.begin(), all.end(), size_t{0});
+    return cut(rows, all, [&](size_t row) { return rows.terminals[row] != 0 || timeouts[row] != 0; });
 }
 
 // ODT's code for antmaze: it makes D4RL's Q-learning tuples (s_t, a_t, r_t, s_{t+1} = the next row), leaving out rows
@@ -323,51 +314,44 @@ inline std::vector<Trajectory> cut_tuples(const Rows& rows, size_t limit) {
         }
         return squared <= 1e-12;  // 1e-6 in norm
     };
-    std::vector<Trajectory> trajectories;
-    std::vector<size_t> open;  // rows of the trajectory that has not ended yet
-    for (size_t i = 0; i < tuples.size(); ++i) {
-        open.push_back(tuples[i]);
-        const bool terminal = rows.terminals[tuples[i]] != 0;
-        if (!terminal && i + 1 < tuples.size() && continues(tuples[i], tuples[i + 1])) continue;
-        trajectories.push_back(trajectory_of(rows, open, terminal));
-        open.clear();
-    }
-    return trajectories;
+    return cut(rows, tuples, [&](size_t i) {
+        return rows.terminals[tuples[i]] != 0 || i + 1 == tuples.size() || !continues(tuples[i], tuples[i + 1]);
+    });
 }
 
 // Returns a data set's trajectories by the rules of the task's family. Errors: dataset.task if the rows are not of this
 // task's size, dataset.empty.
 inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTask& task, const std::string& path) {
-    if (rows.state_dim != static_cast<size_t>(task.state_dim) ||
-        rows.action_dim != static_cast<size_t>(task.action_dim))
-        fail("dataset.task",
-             "%s: has %zu state and %zu action numbers a step; %s has %d and %d: is it of another task?", path.c_str(),
-             rows.state_dim, rows.action_dim, task.name, task.state_dim, task.action_dim);
+    const size_t state_dim = task.state_dim, action_dim = task.action_dim;
+    require(rows.state_dim == state_dim && rows.action_dim == action_dim, "dataset.task", path, ": has ",
+            rows.state_dim, " state and ", rows.action_dim, " action numbers a step; ", task.name, " has ", state_dim,
+            " and ", action_dim, ": is it of another task?");
     const size_t limit = static_cast<size_t>(task.max_episode_steps);
     std::vector<Trajectory> trajectories =
         task.rules == Rules::antmaze ? cut_tuples(rows, limit) : cut_at_flags(rows, limit);
-    if (trajectories.empty())
-        fail("dataset.empty", "%s: no step is marked as the end of a trajectory, so there is none", path.c_str());
+    require(!trajectories.empty(), "dataset.empty", path,
+            ": no step is marked as the end of a trajectory, so there is none");
     return trajectories;
 }
 
 // Requires what a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding
 // error. Errors: dataset.not_finite, dataset.action with the row and the column.
 inline void require_sound(const Rows& rows, const std::string& path) {
-    const auto require = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
+    const auto require_all = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
         for (size_t i = 0; i < values.size(); ++i) {
             if (std::fabs(values[i]) <= bound) continue;  // never so for NaN
             const bool finite = std::isfinite(values[i]);
-            fail(finite ? "dataset.action" : "dataset.not_finite", "%s: \"%s\", row %zu, column %zu is %g; %s",
-                 path.c_str(), name, i / width, i % width, static_cast<double>(values[i]),
-                 finite ? "actions lie in [-1, 1]: is it of another task, or not scaled?"
-                        : "only finite numbers can be learned from");
+            const std::string found = text_of("\", row ", i / width, ", column ", i % width, " is ", values[i]);
+            require(!finite, "dataset.action", path, ": \"", name, found,
+                    "; actions lie in [-1, 1]: is it of another task, or not scaled?");
+            require(finite, "dataset.not_finite", path, ": \"", name, found,
+                    "; only finite numbers can be learned from");
         }
     };
     constexpr float any = std::numeric_limits<float>::max();
-    require("observations", rows.observations, rows.state_dim, any);
-    require("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
-    require("rewards", rows.rewards, 1, any);
+    require_all("observations", rows.observations, rows.state_dim, any);
+    require_all("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
+    require_all("rewards", rows.rewards, 1, any);
 }
 
 // The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.

@@ -10,7 +10,6 @@
 // the rows.
 #pragma once
 
-#include <memory>
 #include <set>
 
 #include "safetensors.hpp"
@@ -26,10 +25,9 @@ inline uint64_t little_endian(Bytes bytes) {
     return value;
 }
 
-// Fails with a sentence about one data set of a file.
-[[noreturn]] inline void fail_dataset(const char* id, const std::string& file, const std::string& dataset,
-                                      const std::string& why) {
-    throw Error(id, file + ": " + json_string(dataset) + ": " + why);
+// Returns what a sentence about one data set of a file begins with.
+inline std::string dataset_place(const std::string& file, const std::string& dataset) {
+    return file + ": " + json_string(dataset) + ": ";
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -53,20 +51,17 @@ inline std::string sha256(Bytes message) {
     static const std::array<uint32_t, 64> constants = sha256_constants();
     std::array<uint32_t, 8> hash = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
                                     0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
-    const size_t blocks = (message.size() + 8) / 64 + 1;
-    for (size_t block = 0; block < blocks; ++block) {
-        // Section 5.1.1: after the message come a one bit, zeros, and the message's length in bits, u64 big-endian.
-        const Bytes rest = message.subspan(std::min(64 * block, message.size()));
-        std::array<uint8_t, 64> bytes{};
-        std::ranges::copy(rest.first(std::min<size_t>(rest.size(), 64)), bytes.begin());
-        if (rest.size() < 64 && 64 * block <= message.size()) bytes[rest.size()] = 0x80;
+    // Section 5.1.1: after the message come a one bit, zeros, and the message's length in bits, u64 big-endian.
+    const size_t whole = message.size() / 64 * 64;  // bytes in full blocks
+    std::vector<uint8_t> last(message.begin() + whole, message.end());
+    last.push_back(0x80);
+    last.resize((last.size() + 8 + 63) / 64 * 64);
+    const uint64_t length = __builtin_bswap64(8 * message.size());
+    std::memcpy(&last[last.size() - 8], &length, 8);
+    for (size_t at = 0; at < whole + last.size(); at += 64) {
         std::array<uint32_t, 64> w;
-        std::memcpy(w.data(), bytes.data(), 64);
+        std::memcpy(w.data(), at < whole ? &message[at] : &last[at - whole], 64);
         for (size_t t = 0; t < 16; ++t) w[t] = __builtin_bswap32(w[t]);
-        if (block + 1 == blocks) {
-            w[14] = static_cast<uint32_t>(message.size() >> 29);
-            w[15] = static_cast<uint32_t>(message.size() << 3);
-        }
         for (size_t t = 16; t < 64; ++t) {
             const uint32_t x = w[t - 15], y = w[t - 2];
             const uint32_t s0 = std::rotr(x, 7) ^ std::rotr(x, 18) ^ x >> 3;
@@ -117,8 +112,7 @@ inline uint32_t lookup3(Bytes key) {
 
 // Returns {first + the sum of value(i) over i < count, the sum of the sums so far}, modulo m. Values have 16 bits, so
 // that no sum reaches 2^64 between two reductions.
-template <class F>
-std::array<uint64_t, 2> running_sums(size_t count, uint64_t first, uint64_t m, const F& value) {
+std::array<uint64_t, 2> running_sums(size_t count, uint64_t first, uint64_t m, const auto& value) {
     uint64_t sum = first, sums = 0;
     for (size_t i = 0; i < count; sum %= m, sums %= m)
         for (const size_t end = std::min<size_t>(count, i + 4096); i < end; ++i) {
@@ -165,27 +159,21 @@ struct HuffmanCode {
     // lengths[s]: bits of the code of symbol s, at most 15; 0: no code. Returns false unless the code is complete, but
     // for one of a single bit or none at all (section 3.2.7).
     bool build(std::span<const uint8_t> lengths) {
-        std::array<uint32_t, 16> count{}, next{};
-        for (const uint8_t length : lengths) ++count[length];
-        uint32_t used = 0, longest = 0;  // `used`: share of all codes, in units of 2^-15
-        for (uint32_t length = 1; length < 16; ++length) {
-            next[length] = used >> (15 - length);
-            used += count[length] << (15 - length);
-            if (count[length] > 0) longest = length;
-        }
-        if (used != 0 && used != 1 << 15 && !(used == 1 << 14 && count[1] == 1)) return false;
+        const uint32_t longest = std::ranges::max(lengths);
         mask = (1u << longest) - 1;
         std::fill_n(entries.begin(), mask + 1, uint16_t{0});
-        for (size_t s = 0; s < lengths.size(); ++s) {
-            const uint32_t length = lengths[s];
-            if (length == 0) continue;
-            const uint32_t code = next[length]++;
-            uint32_t reversed = 0;
-            for (uint32_t bit = 0; bit < length; ++bit) reversed |= (code >> bit & 1) << (length - 1 - bit);
-            for (uint32_t i = reversed; i <= mask; i += 1u << length)
-                entries[i] = static_cast<uint16_t>(s << 4 | length);
-        }
-        return true;
+        uint32_t next = 0;  // the next code, in the highest of 15 bits; 2^15: none is left
+        for (uint32_t length = 1; length <= longest; ++length)
+            for (size_t s = 0; s < lengths.size(); ++s) {
+                if (lengths[s] != length) continue;
+                if (next >= 1 << 15) return false;
+                uint32_t reversed = 0;
+                for (uint32_t bit = 0; bit < length; ++bit) reversed |= (next >> (14 - bit) & 1) << bit;
+                for (uint32_t i = reversed; i <= mask; i += 1u << length)
+                    entries[i] = static_cast<uint16_t>(s << 4 | length);
+                next += 1u << (15 - length);
+            }
+        return next == 0 || next == 1 << 15 || longest == 1;
     }
 };
 
@@ -249,6 +237,7 @@ struct Inflater {
 
     void read_codes() {
         constexpr uint8_t order[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
+        constexpr uint8_t least[3] = {3, 3, 11}, extra[3] = {2, 3, 7};  // of symbols 16 to 18: repetitions, extra bits
         source.refill();
         const size_t n_symbols = source.take(5) + 257, n_distances = source.take(5) + 1, n_order = source.take(4) + 4;
         if (n_symbols > 286 || n_distances > 30) bad_stream("too many codes");
@@ -264,17 +253,14 @@ struct Inflater {
             const uint32_t symbol = source.decode(symbols);
             if (symbol == 16 && lengths.empty()) bad_stream("a repeated code length before the first");
             const auto value = static_cast<uint8_t>(symbol < 16 ? symbol : symbol == 16 ? lengths.back() : 0);
-            const size_t times = symbol < 16    ? 1
-                                 : symbol == 16 ? 3 + source.take(2)
-                                 : symbol == 17 ? 3 + source.take(3)
-                                                : 11 + source.take(7);
+            const size_t times = symbol < 16 ? 1 : least[symbol - 16] + source.take(extra[symbol - 16]);
             lengths.insert(lengths.end(), times, value);
         }
         if (lengths.size() > n_symbols + n_distances) bad_stream("more code lengths than codes");
         if (lengths[256] == 0) bad_stream("no code for the end of the block");
-        if (!symbols.build(std::span(lengths).first(n_symbols)) ||
-            !distances.build(std::span(lengths).last(n_distances)))
-            bad_stream("an invalid set of code lengths");
+        const std::span<const uint8_t> all(lengths);
+        const bool valid = symbols.build(all.first(n_symbols)) && distances.build(all.last(n_distances));
+        if (!valid) bad_stream("an invalid set of code lengths");
     }
 
     void compressed() {
@@ -371,13 +357,13 @@ void convert_elements(const Hdf5Element& element, Bytes from, T* to) {
 
 struct Hdf5Chunk {
     uint64_t address, size;  // where and how many bytes in the file
-    uint64_t place;          // in the grid of chunks, row-major
-    uint32_t skipped;        // bit i: filter i was not applied
+    uint32_t skipped = 0;    // bit i: filter i was not applied
+    Shape place = {};        // which one, in each dimension, of the data set's chunks; of data in one run: {}
 };
 
 enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
 
-// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has counts (2, 3); the last chunk of
+// All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has 2 times 3; the last chunk of
 // each row hangs over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
 struct Hdf5Dataset {
     std::string path;         // "infos/qpos": no slash at the start
@@ -388,7 +374,6 @@ struct Hdf5Dataset {
 
     Hdf5Element element;
     Shape chunk;                           // extents of a chunk; of data in one run: the shape
-    Shape counts;                          // chunks in each dimension
     std::vector<Hdf5Filter> filters;       // in the order in which the writer applied them
     Bytes fill;                            // one element as stored; empty: zeros
     std::vector<Hdf5Chunk> chunks;         // those that exist
@@ -397,7 +382,7 @@ struct Hdf5Dataset {
 
 struct Hdf5File {
     std::string path;
-    std::shared_ptr<const void> owner;              // of `bytes`
+    std::shared_ptr<const std::string> owner;       // of `bytes`
     Bytes bytes;                                    // the file from its superblock on; all addresses count from there
     std::vector<Hdf5Dataset> datasets;              // sorted by path, bytewise
     std::map<std::string, std::string> links = {};  // soft and external: path -> what it leads to
@@ -418,8 +403,8 @@ struct Hdf5File {
             at = link->second + (end == std::string::npos ? "" : at.substr(end));
             if (at.starts_with('/')) at.erase(0, 1);  // a link to the root group
         }
-        fail_dataset("hdf5.link", path, name,
-                     "is a link to " + json_string(at) + ", which is no data set of this file");
+        throw Error("hdf5.link", dataset_place(path, name) + "is a link to " + json_string(at) +
+                                     ", which is no data set of this file");
     }
 
     // Returns the paths of all data sets and links.
@@ -434,10 +419,8 @@ struct Hdf5File {
     std::vector<uint8_t> read_flags(const Hdf5Dataset& dataset) const {
         const std::vector<double> values = read<double>(dataset);
         const auto other = std::ranges::find_if(values, [](double value) { return value != 0 && value != 1; });
-        if (other != values.end())
-            fail_dataset("hdf5.flag", path, dataset.path,
-                         "element " + std::to_string(other - values.begin()) +
-                             " is neither 0 nor 1, so this is no data set of flags");
+        require(other == values.end(), "hdf5.flag", dataset_place(path, dataset.path), "element ",
+                other - values.begin(), " is neither 0 nor 1, so this is no data set of flags");
         return {values.begin(), values.end()};
     }
 
@@ -446,10 +429,9 @@ struct Hdf5File {
     template <class T>
     std::vector<T> read(const Hdf5Dataset& dataset) const {
         const Hdf5Element& element = dataset.element;
-        if (!dataset.unsupported.empty())
-            fail_dataset("hdf5.unsupported", path, dataset.path, "cannot be read: " + dataset.unsupported);
-        if (element.kind == Hdf5Element::text)
-            fail_dataset("hdf5.type", path, dataset.path, "is " + dataset.type + ", expected numbers");
+        const std::string place = dataset_place(path, dataset.path);
+        require(dataset.unsupported.empty(), "hdf5.unsupported", place, "cannot be read: ", dataset.unsupported);
+        require(element.kind != Hdf5Element::text, "hdf5.type", place, "is ", dataset.type, ", expected numbers");
         std::vector<T> out(dataset.elements,
                            dataset.fill.empty() ? T{} : element_value<T>(element, dataset.fill.data()));
         std::vector<uint8_t> buffer;
@@ -458,11 +440,10 @@ struct Hdf5File {
             if (dataset.chunk == dataset.shape)
                 convert_elements(element, data, out.data());
             else
-                convert_chunk(dataset, chunk.place, data, out.data());
+                convert_chunk(dataset, chunk.place, data, out.data(), out.size());
         }
         return out;
     }
-    std::vector<float> read_floats(const Hdf5Dataset& dataset) const { return read<float>(dataset); }
 
     // Returns the chunk_bytes bytes of a chunk, its filters undone from the last to the first (SPEC IV.A.2.l). They lie
     // in the file or in the buffer.
@@ -479,21 +460,19 @@ struct Hdf5File {
                 data = filter == Hdf5Filter::fletcher ? without_checksum(data) : buffer;
                 sums -= filter == Hdf5Filter::fletcher;
             }
-            if (data.size() != dataset.chunk_bytes)
-                throw Error("hdf5.format", "a chunk of another size than the others");
+            require(data.size() == dataset.chunk_bytes, "hdf5.format", "a chunk of another size than the others");
         } catch (const Error& error) {
-            fail_dataset(error.id.c_str(), path, dataset.path,
-                         "chunk at offset " + std::to_string(chunk.address) + ": found " + error.what() +
-                             "; the file is damaged, use another copy");
+            throw Error(error.id, text_of(dataset_place(path, dataset.path), "chunk at offset ", chunk.address,
+                                          ": found ", error.what(), "; the file is damaged, use another copy"));
         }
         return data;
     }
 
     static Bytes without_checksum(Bytes data) {
-        if (data.size() < 4) throw Error("hdf5.checksum", "no room for a checksum");
+        require(data.size() >= 4, "hdf5.checksum", "no room for a checksum");
         const Bytes covered = data.first(data.size() - 4);
-        if (little_endian(data.last(4)) != fletcher32(covered))
-            throw Error("hdf5.checksum", "data that do not match their Fletcher-32 checksum");
+        const bool holds = little_endian(data.last(4)) == fletcher32(covered);
+        require(holds, "hdf5.checksum", "data that do not match their Fletcher-32 checksum");
         return covered;
     }
 
@@ -506,26 +485,16 @@ struct Hdf5File {
         return out;
     }
 
-    // Converts the part of a chunk that lies within the data set, row after row of the last dimension.
-    template <class T>
-    static void convert_chunk(const Hdf5Dataset& dataset, uint64_t place, Bytes data, T* out) {
-        const Shape &shape = dataset.shape, &chunk = dataset.chunk;
-        Shape start(shape.size());  // of the chunk's first element in the data set
-        for (size_t k = start.size(); k-- > 0; place /= dataset.counts[k])
-            start[k] = place % dataset.counts[k] * chunk[k];
-        const size_t size = dataset.element.size, width = chunk.back() * size;
-        const size_t within = std::min(chunk.back(), shape.back() - start.back()) * size;
-        for (size_t row = 0; row < data.size() / width; ++row) {
-            size_t rest = row, to = start.back(), stride = shape.back();
-            bool inside = true;
-            for (size_t k = shape.size() - 1; k-- > 0; rest /= chunk[k]) {
-                const size_t index = start[k] + rest % chunk[k];
-                inside = inside && index < shape[k];
-                to += index * stride;
-                stride *= shape[k];
-            }
-            if (inside) convert_elements(dataset.element, data.subspan(row * width, within), out + to);
-        }
+    // Converts the part of a chunk that lies within the data set: of its dimensions from k on, with `size` elements in
+    // all, to the array that begins at `out`.
+    static void convert_chunk(const Hdf5Dataset& dataset, const Shape& place, Bytes data, auto* out, size_t size,
+                              size_t k = 0) {
+        const size_t extent = dataset.shape[k], in_chunk = dataset.chunk[k], start = place[k] * in_chunk;
+        const size_t inside = std::min(in_chunk, extent - start), row = data.size() / in_chunk, stride = size / extent;
+        out += start * stride;
+        if (k + 1 == place.size()) return convert_elements(dataset.element, data.first(inside * row), out);
+        for (size_t i = 0; i < inside; ++i)
+            convert_chunk(dataset, place, data.subspan(i * row, row), out + i * stride, stride, k + 1);
     }
 };
 
@@ -550,8 +519,7 @@ inline constexpr uint64_t undefined_address = ~uint64_t{0};
 
 // SPEC II.A. The place of the signature in a file of `size` bytes: 0, 512, 1024, 2048, ..., since a user block may come
 // before it. peek(at) returns the 8 bytes there.
-template <class Peek>
-std::optional<size_t> superblock_place(size_t size, Peek&& peek) {
+std::optional<size_t> superblock_place(size_t size, const auto& peek) {
     for (size_t at = 0; at + 8 <= size; at = at == 0 ? 512 : 2 * at)
         if (peek(at) == "\x89HDF\r\n\x1a\n") return at;
     return {};
@@ -560,7 +528,9 @@ std::optional<size_t> superblock_place(size_t size, Peek&& peek) {
 // The same of a file on the disk, of which it reads no more. Errors: file.open, file.not_regular, file.read.
 inline bool has_superblock(const std::string& path) {
     const File file(path, O_RDONLY, "file.open", "open it");
-    return superblock_place(file.size(), [&](size_t at) { return file.peek(at, 8); }).has_value();
+    std::string bytes(8, '\0');
+    const auto peek = [&](size_t at) { return file.read_at(at, bytes.data(), 8) == 8 ? bytes : ""; };
+    return superblock_place(file.size(), peek).has_value();
 }
 
 // Links in a circle, or one structure used again and again, end when more has been read than `budget`, a few times the
@@ -571,23 +541,24 @@ struct Hdf5Parser {
     std::string object = "superblock";  // being read, for messages
     std::set<uint64_t> groups = {};     // addresses already visited
 
-    [[noreturn]] void damaged(const char* id, uint64_t offset, std::string_view expected) const {
-        fail(id, "%s: %s: offset %zu: expected %s; the file is damaged or of a kind unknown to this reader",
-             file.path.c_str(), object.c_str(), static_cast<size_t>(offset), std::string(expected).c_str());
+    // Fails with what was expected at this offset, unless the condition holds.
+    void require_at(uint64_t offset, bool holds, const char* id, const auto&... expected) const {
+        require(holds, id, file.path, ": ", object, ": offset ", offset, ": expected ", expected...,
+                "; the file is damaged or of a kind unknown to this reader");
     }
     void require_inside(uint64_t offset, uint64_t n) const {
-        if (offset > file.bytes.size() || n > file.bytes.size() - offset)
-            damaged("hdf5.truncated", offset,
-                    std::to_string(n) + " bytes (the file ends at " + std::to_string(file.bytes.size()) + ")");
+        const uint64_t end = file.bytes.size();
+        require_at(offset, offset <= end && n <= end - offset, "hdf5.truncated", n, " bytes (the file ends at ", end,
+                   ")");
     }
     void charge(uint64_t offset, uint64_t n) {
-        if (n > budget) damaged("hdf5.cycle", offset, "an end: structures refer to each other in a circle");
+        require_at(offset, n <= budget, "hdf5.cycle", "an end: structures refer to each other in a circle");
         budget -= n;
     }
     uint64_t product(uint64_t a, uint64_t b, uint64_t offset) const {
-        uint64_t result;
-        if (__builtin_mul_overflow(a, b, &result)) damaged("hdf5.too_large", offset, "a size of at most 64 bits");
-        return result;
+        const bool overflow = __builtin_mul_overflow(a, b, &a);
+        require_at(offset, !overflow, "hdf5.too_large", "a size of at most 64 bits");
+        return a;
     }
     static uint64_t quotient(uint64_t a, uint64_t b) { return a / b + (a % b != 0 ? 1 : 0); }  // rounded up
     static uint64_t log2(uint64_t value) { return static_cast<uint64_t>(std::bit_width(value)) - 1; }
@@ -599,20 +570,18 @@ struct Hdf5Parser {
         uint64_t start = at;
 
         Bytes take(uint64_t n) {
-            if (n > end - at)
-                parser.damaged("hdf5.truncated", at, std::to_string(n) + " bytes before " + std::to_string(end));
+            parser.require_at(at, n <= end - at, "hdf5.truncated", n, " bytes before ", end);
             parser.charge(at, n);
             at += n;
             return parser.file.bytes.subspan(at - n, n);
         }
         uint64_t number(uint64_t size) { return little_endian(take(size)); }
         // Returns the next fields, given their sizes in bytes; one of more than 8 bytes is not needed here.
-        template <class... Sizes>
-        std::array<uint64_t, sizeof...(Sizes)> fields(Sizes... sizes) {
-            return {number(static_cast<uint64_t>(sizes))...};  // braces: from the first to the last
+        auto fields(auto... sizes) {
+            return std::array{number(static_cast<uint64_t>(sizes))...};  // braces: from the first to the last
         }
         void expect(bool holds, std::string_view what, const char* id = "hdf5.format") const {
-            if (!holds) parser.damaged(id, start, what);
+            parser.require_at(start, holds, id, what);
         }
         void signature(std::string_view letters) {
             const Bytes found = take(letters.size());
@@ -653,7 +622,7 @@ struct Hdf5Parser {
         const Bytes all = file.bytes;
         const auto peek = [&](size_t at) { return std::string(all.begin() + at, all.begin() + at + 8); };
         const std::optional<size_t> place = superblock_place(all.size(), peek);
-        if (!place) fail("hdf5.format", "%s: is not an HDF5 file (it has no superblock)", file.path.c_str());
+        require(place.has_value(), "hdf5.format", file.path, ": is not an HDF5 file (it has no superblock)");
         file.bytes = all.subspan(*place);
         Cursor c = cursor(8);
         c.start = 0;
@@ -663,9 +632,8 @@ struct Hdf5Parser {
         c.expect(offsets == 8 && lengths == 8, "offsets and lengths of 8 bytes", "hdf5.unsupported");
         const int before = version == 0 ? 9 : version == 1 ? 13 : 1;  // bytes up to the base address
         const auto [flags, base_address, more, end, driver, root] = c.fields(before, 8, 8, 8, version < 2 ? 16 : 0, 8);
-        if (end > all.size())
-            fail("hdf5.truncated", "%s: has %zu bytes, its superblock says %zu; the file was cut off",
-                 file.path.c_str(), all.size(), size_t{end});
+        require(end <= all.size(), "hdf5.truncated", file.path, ": has ", all.size(), " bytes, its superblock says ",
+                end, "; the file was cut off");
         if (version >= 2) c.checksum();
         link("", root, 0);
         std::ranges::sort(file.datasets, {}, &Hdf5Dataset::path);
@@ -732,12 +700,12 @@ struct Hdf5Parser {
     // Reads the data set or group that a link leads to. A link to a named type is passed over.
     void link(const std::string& path, uint64_t address, int depth) {
         object = path.empty() ? "root group" : json_string(path);
-        if (depth > 32 || path.size() > 4096) damaged("hdf5.cycle", address, "at most 32 groups in each other");
+        require_at(address, depth <= 32 && path.size() <= 4096, "hdf5.cycle", "at most 32 groups in each other");
         const std::vector<Message> header = messages(address);
         const auto has = [&](uint64_t type) { return std::ranges::find(header, type, &Message::type) != header.end(); };
         if (has(0x08)) return dataset(path, header);
         if (!has(0x11) && !has(0x02)) return;
-        if (!groups.insert(address).second) damaged("hdf5.cycle", address, "a group that is linked to once");
+        require_at(address, groups.insert(address).second, "hdf5.cycle", "a group that is linked to once");
         Links links;
         for (const Message& message : header) {
             if (message.type == 0x11) symbol_table(links, message.data);
@@ -746,8 +714,8 @@ struct Hdf5Parser {
             if (message.type == 0x0C && path.empty() && (message.flags & 2) == 0) attribute(message.data);
         }
         for (const auto& [name, child, to] : links) {
-            if (name.empty() || has_control(name) || name.find('/') != std::string::npos)
-                damaged("hdf5.format", address, "names without slashes and control characters");
+            const bool plain = !name.empty() && !has_control(name) && name.find('/') == std::string::npos;
+            require_at(address, plain, "hdf5.format", "names without slashes and control characters");
             const std::string parent = path.empty() ? "" : path + "/";
             if (!to) {
                 link(parent + name, child, depth + 1);
@@ -801,8 +769,7 @@ struct Hdf5Parser {
     // SPEC III.A.1: a version-1 B-tree. Calls leaf(key, child) in order; only `leaf` knows what a key means.
     //   TREE | type | level | entries 2 | siblings 8, 8 | key 0 | child 0: address 8 | key 1 | child 1 | ...
     static constexpr uint64_t any_level = 256;
-    template <class F>
-    void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const F& leaf, uint64_t level = any_level) {
+    void b_tree_1(uint64_t address, uint64_t type, uint64_t key_size, const auto& leaf, uint64_t level = any_level) {
         Cursor c = structure(address, "TREE", type);
         const auto [depth, entries, siblings] = c.fields(1, 2, 16);
         c.expect(level == any_level || depth == level, "a node one level below the last");
@@ -863,8 +830,7 @@ struct Hdf5Parser {
     //   BTHD 0 | type | node size 4 | record size 2 | depth 2 | percents 1, 1 | root 8 | its records 2 | all 8 | sum
     //   BTLF 0 or BTIN 0 | type | records | in BTIN pointers, one more than records | sum
     //   pointer   child 8 | its records | records of its subtree; each in as few bytes as its greatest value needs
-    template <class F>
-    void b_tree_2(uint64_t address, uint64_t type, const F& record) {
+    void b_tree_2(uint64_t address, uint64_t type, const auto& record) {
         Cursor c = structure(address, "BTHD", 0);
         c.expect(c.number(1) == type, "a B-tree of type " + std::to_string(type));
         const auto [node_size, record_size, depth, percents, root, count, all] = c.fields(4, 2, 2, 2, 8, 2, 8);
@@ -915,16 +881,14 @@ struct Hdf5Parser {
         const auto [width, smallest, largest, bits, first_rows, root, root_rows] = c.fields(2, 8, 8, 2, 2, 8, 2);
         c.checksum();
         const bool powers = std::has_single_bit(width) && std::has_single_bit(smallest) && std::has_single_bit(largest);
-        c.expect(
-            powers && smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && most > 0 && root_rows <= 64,
-            "a doubling table of powers of two");
+        const bool sizes = smallest <= largest && largest <= uint64_t{1} << 32 && bits <= 64 && root_rows <= 64;
+        c.expect(powers && sizes && most > 0, "a doubling table of powers of two");
         const uint64_t direct_rows = log2(largest) - log2(smallest) + 2;
         Heap heap{(bits + 7) / 8, log2(std::min(most, largest)) / 8 + 1};
         const auto block_of = [&](uint64_t at, const char* letters, std::optional<uint64_t> size, uint64_t offset) {
             Cursor block = structure(at, letters, 0, size);
             const bool same = block.number(8) == address && block.number(heap.offset_width) == offset;
-            block.expect(same,
-                         "a block of the heap at " + std::to_string(address) + ", offset " + std::to_string(offset));
+            block.expect(same, text_of("a block of the heap at ", address, ", offset ", offset));
             return block;
         };
         const auto direct = [&](uint64_t at, uint64_t size, uint64_t offset) {
@@ -985,12 +949,14 @@ struct Hdf5Parser {
     // A data set in the making, and what is read of its header but not kept.
     struct Grid : Hdf5Dataset {
         Shape most;                // the extents to which the data set may grow; ~0: without limit
+        Shape counts;              // chunks in each dimension
         uint64_t all = 1;          // chunks
         bool whole_edges = false;  // chunks that hang over the edge are not filtered
         // Arrays number the chunks row-major, by `most`; if one dimension is unlimited, it counts slowest, whichever it
         // is (H5D__earray_idx in HDF5; SPEC is silent).
-        std::vector<size_t> order;  // dimensions, slowest first
-        Shape step;                 // step[k]: numbers from one chunk to the next in dimension order[k]
+        std::vector<size_t> order;                          // dimensions, slowest first
+        Shape step;                                         // [k]: from one chunk to the next in dimension order[k]
+        uint64_t index = 0, entry_size = 0, page_size = 0;  // an array's header; bytes of an entry; entries of a page
     };
 
     void dataset(const std::string& path, const std::vector<Message>& header) {
@@ -1134,7 +1100,7 @@ struct Hdf5Parser {
         const uint64_t address = kind == 0 ? c.at : elsewhere;
         if (total == 0 || address == undefined_address) return;
         c.expect(size >= total, std::to_string(total) + " bytes of data");
-        add(g, {}, {address, total, 0, 0}, c.start);
+        add(g, {address, total}, c.start);
     }
 
     // Returns count * size, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are
@@ -1166,17 +1132,17 @@ struct Hdf5Parser {
         bounded(g.all, g.chunk_bytes, c);
         g.whole_edges = (flags & 1) != 0;
         if (g.elements == 0) return;
-        Shape place(rank);
         if (version == 3 && tree == undefined_address) return;
         if (version == 3)
-            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t chunk) {
+            return b_tree_1(tree, 1, 16 + 8 * rank, [&](Cursor key, uint64_t address) {
                 const auto [size, skipped] = key.fields(4, 4);
+                Hdf5Chunk chunk{address, size, static_cast<uint32_t>(skipped)};
                 for (size_t k = 0; k < rank; ++k) {
                     const uint64_t first = key.number(8);
                     key.expect(first % g.chunk[k] == 0, "a chunk that begins at a multiple of its extents");
-                    place[k] = first / g.chunk[k];
+                    chunk.place.push_back(first / g.chunk[k]);
                 }
-                add(g, place, {chunk, size, 0, static_cast<uint32_t>(skipped)}, key.start);
+                add(g, chunk, key.start);
             });
         const uint64_t index = c.number(1);
         c.expect(index >= 1 && index <= 5, "a chunk index of type 1 to 5");
@@ -1186,34 +1152,35 @@ struct Hdf5Parser {
         c.take(parameters[index]);
         const uint64_t address = c.number(8);
         if (address == undefined_address) return;
-        if (index == 1)
-            return add(g, place, {address, alone ? stored : g.chunk_bytes, 0, static_cast<uint32_t>(skipped)}, c.start);
+        const Hdf5Chunk single{address, alone ? stored : g.chunk_bytes, static_cast<uint32_t>(skipped), Shape(rank)};
+        if (index == 1) return add(g, single, c.start);
         if (index == 5)
             return b_tree_2(address, g.filters.empty() ? 10 : 11, [&](Cursor record) {
-                const Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
-                for (uint64_t& coordinate : place) coordinate = record.number(8);
-                add(g, place, chunk, record.start);
+                Hdf5Chunk chunk = index_entry(g, record, record.end - record.at - 8 * rank);
+                for (size_t k = 0; k < rank; ++k) chunk.place.push_back(record.number(8));
+                add(g, chunk, record.start);
             });
         for (size_t k = 0; k < rank; ++k)
             g.order.insert(g.most[k] == ~uint64_t{0} ? g.order.begin() : g.order.end(), k);
         g.step.assign(rank, 1);
         for (size_t k = rank; k-- > 1;)
             g.step[k - 1] = product(g.step[k], quotient(g.most[g.order[k]], g.chunk[g.order[k]]), c.at);
-        if (index == 2) return implicit_index(g, address);
-        index == 3 ? fixed_array(g, address) : extensible_array(g, address);
+        g.index = address;
+        if (index == 2) implicit_index(g);
+        if (index == 3) fixed_array(g);
+        if (index == 4) extensible_array(g);
     }
 
-    // `place`: which chunk, in each dimension. Those beyond the edge are left over from when the data set was larger.
-    void add(Grid& g, const Shape& place, Hdf5Chunk chunk, uint64_t offset) {
+    // Chunks beyond the edge are left over from when the data set was larger.
+    void add(Grid& g, Hdf5Chunk chunk, uint64_t offset) {
         if (chunk.address == undefined_address) return;
         bool partial = false;
-        for (size_t k = 0; k < place.size(); ++k) {
-            if (place[k] >= g.counts[k]) return;
-            chunk.place = chunk.place * g.counts[k] + place[k];
-            partial = partial || g.shape[k] - place[k] * g.chunk[k] < g.chunk[k];
+        for (size_t k = 0; k < chunk.place.size(); ++k) {
+            if (chunk.place[k] >= g.counts[k]) return;
+            partial = partial || g.shape[k] - chunk.place[k] * g.chunk[k] < g.chunk[k];
         }
         if (g.whole_edges && partial) chunk.skipped = ~0u;
-        if (g.chunks.size() >= g.all) damaged("hdf5.format", offset, "each chunk once");
+        require_at(offset, g.chunks.size() < g.all, "hdf5.format", "each chunk once");
         require_inside(chunk.address, chunk.size);
         charge(offset, sizeof chunk);
         g.chunks.push_back(chunk);
@@ -1225,64 +1192,60 @@ struct Hdf5Parser {
         const bool filtered = !g.filters.empty();
         c.expect(filtered ? size > 12 && size <= 20 : size == 8, "entries of 8 bytes, or with filters of 13 to 20");
         const uint64_t address = c.number(8), stored = filtered ? c.number(size - 12) : g.chunk_bytes;
-        return {address, stored, 0, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
+        return {address, stored, static_cast<uint32_t>(filtered ? c.number(4) : 0)};
+    }
+
+    // Returns the place of the chunk that has this number in an array.
+    static Shape place_of(const Grid& g, uint64_t number) {
+        Shape place(g.order.size());
+        for (size_t k = 0; k < place.size(); number %= g.step[k++]) place[g.order[k]] = number / g.step[k];
+        return place;
     }
 
     // SPEC VII.B: chunk after chunk, without an index.
-    void implicit_index(Grid& g, uint64_t address) {
-        Shape place(g.order.size());
-        for (uint64_t i = 0; i < g.all; ++i) {
-            uint64_t number = 0, rest = i;
-            for (size_t k = place.size(); k-- > 0; rest /= g.counts[k]) place[k] = rest % g.counts[k];
-            for (size_t k = 0; k < place.size(); ++k) number += place[g.order[k]] * g.step[k];
-            const uint64_t begin = address + product(number, g.chunk_bytes, address);
-            add(g, place, {begin, g.chunk_bytes, 0, 0}, address);
-        }
+    void implicit_index(Grid& g) {
+        uint64_t last = 0;  // number of the last chunk of the data set
+        for (size_t k = 0; k < g.step.size(); ++k) last += product(g.counts[g.order[k]] - 1, g.step[k], g.index);
+        require_inside(g.index, product(last + 1, g.chunk_bytes, g.index));
+        for (uint64_t number = 0; number <= last; ++number)
+            add(g, {g.index + number * g.chunk_bytes, g.chunk_bytes, 0, place_of(g, number)}, g.index);
     }
 
     // The index is an array of entries, numbered from 0. Its header and blocks (SPEC VII.C and D) begin alike:
     //   letters 0 | filtered? | in blocks: the header's address 8 | ...
     // and hold `count` entries from number `first` on, in pages (each with a checksum) if they are more than a page.
-    struct EntryArray {
-        uint64_t address, size, page;  // of the header; bytes of an entry; entries of a page
-    };
-
-    Cursor array_block(const Grid& g, uint64_t address, const std::string& letters, uint64_t header) {
+    Cursor array_block(const Grid& g, uint64_t address, const std::string& letters) {
         Cursor c = structure(address, letters, 0);
         c.expect(c.number(1) == (g.filters.empty() ? 0 : 1), "an index of chunks filtered as the data set says");
-        c.expect(header == 0 || c.number(8) == header, "a block of the index at " + std::to_string(header));
+        const bool same = address == g.index || c.number(8) == g.index;
+        c.expect(same, "a block of the index at " + std::to_string(g.index));
         return c;
     }
 
-    void entries(Grid& g, const EntryArray& array, Cursor& c, uint64_t first, uint64_t count) {
-        Shape place(g.order.size());
-        for (uint64_t i = 0; i < count; ++i) {
-            const Hdf5Chunk chunk = index_entry(g, c, array.size);
-            uint64_t number = first + i;
-            for (size_t k = 0; k < place.size(); ++k) {
-                place[g.order[k]] = number / g.step[k];
-                number %= g.step[k];
-            }
-            add(g, place, chunk, c.start);
+    void entries(Grid& g, Cursor& c, uint64_t first, uint64_t count) {
+        for (uint64_t number = first; number < first + count; ++number) {
+            Hdf5Chunk chunk = index_entry(g, c, g.entry_size);
+            chunk.place = place_of(g, number);
+            add(g, chunk, c.start);
         }
     }
 
     // Reads a data block of `count` entries. `written`: a bit for each page, the highest of a byte first; page 0 has
     // bit number `bit`. These bits are in a secondary block, or, if there is none, at the block's beginning.
-    void data_block(Grid& g, const EntryArray& array, const std::string& letters, uint64_t address, uint64_t prefix,
-                    uint64_t first, uint64_t count, Bytes written, uint64_t bit) {
-        Cursor c = array_block(g, address, letters, array.address);
-        const bool paged = count > array.page;
-        Cursor body = c.checked(prefix + (paged ? 0 : product(array.size, count, address)));
+    void data_block(Grid& g, const std::string& letters, uint64_t address, uint64_t prefix, uint64_t first,
+                    uint64_t count, Bytes written, uint64_t bit) {
+        Cursor c = array_block(g, address, letters);
+        const bool paged = count > g.page_size;
+        Cursor body = c.checked(prefix + (paged ? 0 : product(g.entry_size, count, address)));
         const Bytes before = body.take(prefix);
-        if (!paged) return entries(g, array, body, first, count);
+        if (!paged) return entries(g, body, first, count);
         if (written.empty()) written = before;
         uint64_t page = c.at;
         for (uint64_t done = 0; done < count; ++bit) {
-            const uint64_t here = std::min(array.page, count - done), bytes_here = product(here, array.size, page);
+            const uint64_t here = std::min(g.page_size, count - done), bytes_here = product(here, g.entry_size, page);
             if ((written[bit / 8] << (bit % 8) & 0x80) != 0) {
                 Cursor entry = cursor(page).checked(bytes_here);
-                entries(g, array, entry, first + done, here);
+                entries(g, entry, first + done, here);
             }
             page += bytes_here + 4;
             done += here;
@@ -1292,14 +1255,16 @@ struct Hdf5Parser {
     // SPEC VII.C.
     //   FAHD ..  entry size 1 | bits of a page's entries 1 | entries 8 | block 8 | sum
     //   FADB ..  entries | sum     or, with pages     bits of the pages | sum | pages
-    void fixed_array(Grid& g, uint64_t address) {
-        Cursor c = array_block(g, address, "FAHD", 0);
+    void fixed_array(Grid& g) {
+        Cursor c = array_block(g, g.index, "FAHD");
         const auto [size, page_bits, count, block] = c.fields(1, 1, 8, 8);
         c.checksum();
         c.expect(page_bits < 64, "pages below 2^64 entries");
         if (block == undefined_address) return;
-        const uint64_t page = uint64_t{1} << page_bits, bitmap = quotient(quotient(count, page), 8);
-        data_block(g, {address, size, page}, "FADB", block, count > page ? bitmap : 0, 0, count, {}, 0);
+        g.entry_size = size;
+        g.page_size = uint64_t{1} << page_bits;
+        const uint64_t bitmap = count > g.page_size ? quotient(quotient(count, g.page_size), 8) : 0;
+        data_block(g, "FADB", block, bitmap, 0, count, {}, 0);
     }
 
     // SPEC VII.D. Entries lie in the index block (the first few), in data blocks to which it points, and in data blocks
@@ -1311,8 +1276,8 @@ struct Hdf5Parser {
     //   EAIB ..  entries | data blocks 8 each | secondary blocks 8 each | sum
     //   EASB ..  number of its first entry | bits of the pages | data blocks 8 each | sum
     //   EADB ..  number of its first entry | entries | sum     or, with pages     .. | sum | pages
-    void extensible_array(Grid& g, uint64_t address) {
-        Cursor c = array_block(g, address, "EAHD", 0);
+    void extensible_array(Grid& g) {
+        Cursor c = array_block(g, g.index, "EAHD");
         const auto [size, bits, direct, least, pointers, page_bits] = c.fields(1, 1, 1, 1, 1, 1);
         const auto [statistics, used, realized, block] = c.fields(32, 8, 8, 8);
         c.checksum();
@@ -1320,27 +1285,28 @@ struct Hdf5Parser {
         c.expect(powers && log2(least) <= bits && bits <= 48 && page_bits < 48,
                  "an index of at most 2^48 chunks in blocks of powers of two");
         if (block == undefined_address) return;
-        const EntryArray array{address, size, uint64_t{1} << page_bits};
+        g.entry_size = size;
+        g.page_size = uint64_t{1} << page_bits;
         const uint64_t levels = 1 + bits - log2(least), in_index = std::min(levels, 2 * log2(pointers));
         const uint64_t offset_width = (bits + 7) / 8;
-        Cursor index = array_block(g, block, "EAIB", address)
-                           .checked(direct * size + 8 * (2 * (pointers - 1) + levels - in_index));
-        entries(g, array, index, 0, direct);
+        const uint64_t addresses_in_index = 2 * (pointers - 1) + levels - in_index;
+        Cursor index = array_block(g, block, "EAIB").checked(direct * size + 8 * addresses_in_index);
+        entries(g, index, 0, direct);
         uint64_t first = direct;
         for (uint64_t u = 0; u < levels && first < used; ++u) {
             const uint64_t blocks = uint64_t{1} << (u / 2), count = (uint64_t{1} << ((u + 1) / 2)) * least;
-            const uint64_t n_pages = count > array.page ? count / array.page : 0;
+            const uint64_t n_pages = count > g.page_size ? count / g.page_size : 0;
             const auto data_blocks = [&](Cursor& addresses, Bytes written) {
                 for (uint64_t b = 0; b < blocks; ++b)
                     if (const uint64_t at = addresses.number(8); at != undefined_address && first + b * count < used)
-                        data_block(g, array, "EADB", at, offset_width, first + b * count, count, written, b * n_pages);
+                        data_block(g, "EADB", at, offset_width, first + b * count, count, written, b * n_pages);
             };
             if (u < in_index) {
                 index.expect(n_pages == 0, "pages only below secondary blocks");
                 data_blocks(index, {});
             } else if (const uint64_t secondary = index.number(8); secondary != undefined_address) {
                 const uint64_t bitmap = blocks * quotient(n_pages, 8);
-                Cursor s = array_block(g, secondary, "EASB", address).checked(offset_width + bitmap + 8 * blocks);
+                Cursor s = array_block(g, secondary, "EASB").checked(offset_width + bitmap + 8 * blocks);
                 s.take(offset_width);
                 const Bytes written = s.take(bitmap);
                 data_blocks(s, written);
@@ -1350,18 +1316,18 @@ struct Hdf5Parser {
     }
 };
 
-// Reads everything but the data. `owner` keeps the bytes alive; `path` is for messages. Errors: hdf5.format,
-// hdf5.truncated, hdf5.cycle, hdf5.checksum, hdf5.too_large, hdf5.unsupported.
-inline Hdf5File parse_hdf5(Bytes bytes, std::shared_ptr<const void> owner, const std::string& path) {
-    Hdf5File file{path, std::move(owner), bytes, {}};
+// Reads everything but the data, from the bytes of a file; `path` is for messages. Errors: hdf5.format, hdf5.truncated,
+// hdf5.cycle, hdf5.checksum, hdf5.too_large, hdf5.unsupported.
+inline Hdf5File parse_hdf5(std::string bytes, const std::string& path) {
+    const auto owner = std::make_shared<const std::string>(std::move(bytes));
+    Hdf5File file{path, owner, as_bytes(*owner), {}};
     Hdf5Parser{file}.superblock();
     return file;
 }
 
 // Of a file without a superblock nothing more is read. Errors: those of parse_hdf5() and read_file().
 inline Hdf5File open_hdf5(const std::string& path) {
-    const auto owner = std::make_shared<const std::string>(has_superblock(path) ? read_file(path) : "");
-    return parse_hdf5(as_bytes(*owner), owner, path);
+    return parse_hdf5(has_superblock(path) ? read_file(path) : "", path);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1381,13 +1347,13 @@ class Hdf5Writer {
 
     // Elements, row-major: float, double, int32_t, or uint8_t for booleans (0 or 1).
     // Errors: hdf5.name, hdf5.shape, hdf5.flag, file.write.
-    template <std::ranges::contiguous_range Range>
-    void add(const std::string& name, const Shape& shape, const Range& range) {
+    void add(const std::string& name, const Shape& shape, const std::ranges::contiguous_range auto& range) {
         const std::span data(range);
-        using T = std::ranges::range_value_t<Range>;
-        if constexpr (std::is_same_v<T, uint8_t>)
-            if (std::ranges::any_of(data, [](uint8_t flag) { return flag > 1; }))
-                fail_dataset("hdf5.flag", file_.path, name, "a flag is neither 0 nor 1");
+        using T = typename decltype(data)::value_type;
+        if constexpr (std::is_same_v<T, uint8_t>) {
+            const bool flags = std::ranges::none_of(data, [](uint8_t flag) { return flag > 1; });
+            require(flags, "hdf5.flag", dataset_place(file_.path, name), "a flag is neither 0 nor 1");
+        }
         add_raw(name, shape, type_of<T>(), sizeof(T), {reinterpret_cast<const char*>(data.data()), data.size_bytes()});
     }
 
@@ -1455,20 +1421,15 @@ class Hdf5Writer {
 
     void add_raw(const std::string& name, const Shape& shape, std::string_view type, size_t size,
                  std::string_view data) {
+        const std::string about_it = dataset_place(file_.path, name);
         std::string space = little(1, 1) + little(shape.size(), 1) + little(0, 6);
         for (const uint64_t extent : shape) {  // `size`: of an element, then of all
-            if (__builtin_mul_overflow(size, extent, &size) || shape.size() > 32)
-                fail_dataset("hdf5.shape", file_.path, name, "shape " + shape_text(shape) + " is too large");
+            const bool small = !__builtin_mul_overflow(size, extent, &size) && shape.size() <= 32;
+            require(small, "hdf5.shape", about_it, "shape ", shape_text(shape), " is too large");
             space += little(extent, 8);
         }
         Node& node = new_node(name);
-        if (data.size() > size)
-            fail_dataset("hdf5.shape", file_.path, name,
-                         std::to_string(data.size()) + " bytes are more than the " + std::to_string(size) +
-                             " that its shape leaves");
-        if (data.size() < size)
-            fail_dataset("hdf5.shape", file_.path, name,
-                         std::to_string(size - data.size()) + " bytes fewer were given than its shape has");
+        require(data.size() == size, "hdf5.shape", about_it, data.size(), " bytes were given, its shape has ", size);
         const uint64_t address = size == 0 ? undefined_address : place(data);
         node.header = header({{0x01, space},                                            // SPEC IV.A.2.b
                               {0x03, std::string(type)},                                // IV.A.2.d
@@ -1485,9 +1446,8 @@ class Hdf5Writer {
             Node& child = node->children[part];
             const bool in_use = !child.header.empty() || (end == name.size() && !child.children.empty());
             const bool no_name = part.empty() || part == "." || !is_utf8(part) || has_control(part);
-            if (in_use || no_name || node->children.size() > 65535)
-                fail_dataset("hdf5.name", file_.path, name,
-                             "cannot name a data set: a part of it is in use or is no name");
+            require(!in_use && !no_name && node->children.size() <= 65535, "hdf5.name", dataset_place(file_.path, name),
+                    "cannot name a data set: a part of it is in use or is no name");
             leaf_k_ = std::max(leaf_k_, (node->children.size() + 1) / 2);
             node = &child;
             at = end + 1;
@@ -1509,8 +1469,8 @@ class Hdf5Writer {
         const size_t count = node.children.size();
         entries.resize(2 * leaf_k_ * 40);
         const uint64_t segment = place(names);
-        const uint64_t heap =
-            place("HEAP" + little(0, 4) + little(names.size(), 8) + little(1, 8) + little(segment, 8));
+        const std::string heap_sizes = little(names.size(), 8) + little(1, 8);  // of the names; 1: nothing is free
+        const uint64_t heap = place("HEAP" + little(0, 4) + heap_sizes + little(segment, 8));
         const uint64_t leaf = place("SNOD" + little(1, 2) + little(count, 2) + entries);
         std::string keys = little(0, 8) + little(leaf, 8) + little(last_name, 8);
         keys.resize(8 * (4 * tree_k + 1));

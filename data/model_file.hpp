@@ -9,8 +9,6 @@
 // and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
 #pragma once
 
-#include <filesystem>
-
 #include "safetensors.hpp"
 #include "settings.hpp"  // and with it the other standard headers
 
@@ -67,29 +65,27 @@ inline void load_parameters(ModelContents& model, const TensorFile& file, std::s
     }
     for (const StoredTensor& tensor : file.tensors)
         if (!known.contains(tensor.name)) unknown.push_back(tensor.name);
-    if (!missing.empty() || !unknown.empty())
-        fail("model.names",
-             "%s: does not hold the network of its settings: %s%s%s%s; are layers, position and method right?",
-             file.path.c_str(), missing.empty() ? "" : "missing ", some_names(missing).c_str(),
-             unknown.empty() ? "" : (missing.empty() ? "unknown " : "; unknown "), some_names(unknown).c_str());
+    std::string differences = missing.empty() ? "" : "missing " + some_names(missing);
+    if (!unknown.empty()) differences += (missing.empty() ? "unknown " : "; unknown ") + some_names(unknown);
+    require(differences.empty(), "model.names", file.path, ": does not hold the network of its settings: ", differences,
+            "; are layers, position and method right?");
     for (Parameter<float>& parameter : model.parameters)
         file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
 }
 
 // Errors: model.value names the tensor that holds a number no network can have.
 inline void check_model(const ModelContents& model, const std::string& path) {
-    const auto require = [&](bool holds, const std::string& name, const char* property) {
-        if (!holds)
-            fail("model.value", "%s: tensor %s holds a number that is not %s", path.c_str(), name.c_str(), property);
+    const auto require_value = [&](bool holds, const std::string& name, const char* property) {
+        require(holds, "model.value", path, ": tensor ", name, " holds a number that is not ", property);
     };
     for (const Parameter<float>& parameter : model.parameters)
-        for (const float value : parameter.value) require(std::isfinite(value), parameter.name, "finite");
+        for (const float value : parameter.value) require_value(std::isfinite(value), parameter.name, "finite");
     const float log_temperature = model.log_temperature.value[0];
-    require(std::isfinite(log_temperature) && std::isfinite(std::exp(log_temperature)), "log_temperature",
-            "finite, nor is its exponential");
-    for (const float value : model.state_mean) require(std::isfinite(value), "state_mean", "finite");
+    const bool finite = std::isfinite(log_temperature) && std::isfinite(std::exp(log_temperature));
+    require_value(finite, "log_temperature", "finite, nor is its exponential");
+    for (const float value : model.state_mean) require_value(std::isfinite(value), "state_mean", "finite");
     for (const float value : model.state_std)
-        require(std::isfinite(value) && value > 0, "state_std", "finite and positive");
+        require_value(std::isfinite(value) && value > 0, "state_std", "finite and positive");
 }
 
 // The counts in the metadata; 0 where the file does not state them. Errors: import.metadata.
@@ -98,9 +94,8 @@ inline void load_counts(ModelContents& model, const TensorFile& file) {
         const auto found = file.metadata.find(name);
         if (found == file.metadata.end()) return 0;
         const std::optional<double> x = to_number(found->second);
-        if (!x || *x < 0 || *x > 1e15 || *x != std::floor(*x))
-            fail("import.metadata", "%s: metadata entry %s is \"%s\", not a number of %s", file.path.c_str(), name,
-                 found->second.substr(0, 80).c_str(), name);
+        require(x && *x >= 0 && *x <= 1e15 && *x == std::floor(*x), "import.metadata", file.path, ": metadata entry ",
+                name, " is \"", found->second.substr(0, 80), "\", not a number of ", name);
         return static_cast<uint64_t>(*x);
     };
     model.updates = count("updates");
@@ -125,9 +120,9 @@ inline Settings settings_in(const TensorFile& file) { return settings_from_text(
 // Errors: model.settings.
 inline void require_room(const TensorFile& file, const Settings& settings) {
     const int64_t weights = 12 * settings.layers * settings.width * settings.width;
-    if (settings.width % settings.heads != 0 || static_cast<uint64_t>(weights) > file.buffer.size() / sizeof(float))
-        fail("model.settings", "%s: does not hold the %lld weights and more that its settings call for",
-             file.path.c_str(), static_cast<long long>(weights));
+    const bool enough = static_cast<uint64_t>(weights) <= file.buffer.size() / sizeof(float);
+    require(settings.width % settings.heads == 0 && enough, "model.settings", file.path, ": does not hold the ",
+            weights, " weights and more that its settings call for");
 }
 
 // Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
@@ -138,9 +133,8 @@ inline std::string model_path(const std::string& given) {
 // Errors: model.format, model.settings, safetensors.*, file.*.
 inline TensorFile open_model(const std::string& given) {
     TensorFile file = read_safetensors(model_path(given));
-    if (!file.metadata.contains("format") || file.text("format") != model_format)
-        fail("model.format", "%s is a safetensors file, but no model that `wodtem train` has written",
-             file.path.c_str());
+    require(file.metadata.contains("format") && file.text("format") == model_format, "model.format", file.path,
+            " is a safetensors file, but no model that `wodtem train` has written");
     require_room(file, settings_in(file));
     return file;
 }
@@ -150,9 +144,9 @@ inline void load_first_weights(ModelContents& model, const TensorFile& file) {
     const Settings theirs = settings_in(file);
     for (const char* name : {"layers", "heads", "width", "position", "state_encoding"}) {
         const SettingRow& row = setting_row(name);
-        if (setting_text(theirs, row) != setting_text(model.settings, row))
-            fail("model.settings", "%s has %s = %s, the run %s; make them equal with --set", file.path.c_str(), name,
-                 setting_text(theirs, row).c_str(), setting_text(model.settings, row).c_str());
+        const std::string its = setting_text(theirs, row), ours = setting_text(model.settings, row);
+        require(its == ours, "model.settings", file.path, " has ", name, " = ", its, ", the run ", ours,
+                "; make them equal with --set");
     }
     load_model(model, file);
 }
@@ -188,9 +182,8 @@ inline std::vector<float> tensor_or_text(const TensorFile& file, const std::stri
         float& value = values.emplace_back(NAN);
         finite = finite && std::from_chars(word.data(), end, value).ptr == end && std::isfinite(value);
     }
-    if (!finite || values.size() != size)
-        fail("import.metadata", "%s: metadata entry %s is not %zu finite number%s separated by spaces",
-             file.path.c_str(), name.c_str(), size, size == 1 ? "" : "s");
+    require(finite && values.size() == size, "import.metadata", file.path, ": metadata entry ", name, " is not ", size,
+            " finite number", size == 1 ? "" : "s", " separated by spaces");
     return values;
 }
 
@@ -242,9 +235,7 @@ inline void export_odt(const std::string& given, const std::string& out) {
 
 // The command `import`: from a file of ODT's code or of export_odt() to a model file. find_statistics(model) is called
 // if the file has none of the states. Errors: model.*, import.*, file.input, safetensors.*.
-template <class FindStatistics>
-void import_odt(const TensorFile& file, const Settings& settings, const std::string& out,
-                FindStatistics&& find_statistics) {
+void import_odt(const TensorFile& file, const Settings& settings, const std::string& out, const auto& find_statistics) {
     require_other_file(out, file.path);
     require_other_file(out, settings.dataset_path);
     require_room(file, settings);
@@ -259,14 +250,11 @@ void import_odt(const TensorFile& file, const Settings& settings, const std::str
     const uint64_t state_dim = static_cast<uint64_t>(model.spec.state_dim);
     model.state_mean = tensor_or_text(file, "state_mean", {state_dim});
     model.state_std = tensor_or_text(file, "state_std", {state_dim});
-    if (model.state_mean.empty() != model.state_std.empty())
-        fail("import.metadata", "%s: has one of state_mean and state_std; it needs both, or neither",
-             file.path.c_str());
+    require(model.state_mean.empty() == model.state_std.empty(), "import.metadata", file.path,
+            ": has one of state_mean and state_std; it needs both, or neither");
     if (model.state_mean.empty()) {
-        if (settings.behaviour == "random")
-            fail("import.normaliser",
-                 "%s has no state_mean and state_std, and there is no data set to take them from; see --dataset",
-                 file.path.c_str());
+        require(settings.behaviour != "random", "import.normaliser", file.path,
+                " has no state_mean and state_std, and there is no data set to take them from; see --dataset");
         find_statistics(model);
     }
     check_model(contents, file.path);

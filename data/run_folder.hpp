@@ -16,16 +16,10 @@
 
 #include <sys/file.h>
 
-#include <array>
-#include <cerrno>
-#include <cstdio>
-#include <cstring>
-#include <filesystem>
-
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
 #include "console.hpp"
-#include "safetensors.hpp"
+#include "safetensors.hpp"  // and with it the standard headers
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -211,7 +205,7 @@ struct Log {
     uint64_t bytes = 0, crc = 0;
 
     void append(const std::string& line) {
-        AppendFile(path).append(line);
+        AppendFile(path).write(line);
         bytes += line.size();
         crc = crc32(line, static_cast<uint32_t>(crc));
     }
@@ -224,10 +218,9 @@ struct Log {
     // Errors: run.log, if the file does not begin with what it held at the checkpoint.
     void check() const {
         const std::string text = std::filesystem::exists(path) ? read_file(path) : "";
-        if (text.size() < bytes || crc32(std::string_view(text).substr(0, bytes)) != crc)
-            fail("run.log",
-                 "%s is not what it was at the checkpoint (%llu bytes); restore it, or remove the folder to start anew",
-                 path.c_str(), static_cast<unsigned long long>(bytes));
+        const bool same = text.size() >= bytes && crc32(std::string_view(text).substr(0, bytes)) == crc;
+        require(same, "run.log", path, " is not what it was at the checkpoint (", bytes,
+                " bytes); restore it, or remove the folder to start anew");
     }
 };
 
@@ -258,19 +251,17 @@ struct RunFolder {
 inline void make_folder(const std::string& path, const char* id) {
     std::error_code problem;
     std::filesystem::create_directories(path, problem);
-    if (problem) fail(id, "cannot make the folder %s: %s", path.c_str(), problem.message().c_str());
+    require(!problem, id, "cannot make the folder ", path, ": ", problem.message());
 }
 
 // Keeps other processes out of a folder for as long as it lives; the system releases it however the process ends.
 // Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
-struct FolderLock {
-    FileDescriptor folder;
-    explicit FolderLock(const std::string& path) : folder(::open(path.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC)) {
-        if (folder.fd < 0) fail_file("run.folder", "open the run folder", path);
-        if (::flock(folder.fd, LOCK_EX | LOCK_NB) == 0) return;
-        if (errno == EWOULDBLOCK)
-            fail("run.busy", "another process is training in %s; wait for it, or choose another folder with --out",
-                 path.c_str());
+struct FolderLock : File {
+    explicit FolderLock(const std::string& name)
+        : File(name, O_RDONLY | O_DIRECTORY, "run.folder", "open the run folder") {
+        if (::flock(fd, LOCK_EX | LOCK_NB) == 0) return;
+        require(errno != EWOULDBLOCK, "run.busy", "another process is training in ", path,
+                "; wait for it, or choose another folder with --out");
         std::fprintf(stderr, "wodtem: %s cannot be locked (%s); make sure that no other process works in it\n",
                      path.c_str(), std::strerror(errno));
     }
@@ -281,9 +272,8 @@ struct FolderLock {
 inline void claim_folder(const RunFolder& folder, const Settings& settings) {
     remove_temporaries(folder.path);
     const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors");
-    if (!folder.has("settings") && has_run)
-        fail("run.folder", "%s holds a run without its settings file; choose another folder with --out",
-             folder.path.c_str());
+    require(folder.has("settings") || !has_run, "run.folder", folder.path,
+            " holds a run without its settings file; choose another folder with --out");
     const std::string path = folder.file("settings");
     if (folder.has("settings") && (has_run || folder.has("finished")))
         require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
@@ -315,14 +305,14 @@ inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit
     const std::string path = folder.file("checkpoint.safetensors");
     try {
         const TensorFile file = read_own_safetensors(path);
-        if (file.text("format") != checkpoint_format)
-            fail("checkpoint.format", "it is no checkpoint of `wodtem train`");
+        const bool checkpoint = file.text("format") == checkpoint_format;
+        require(checkpoint, "checkpoint.format", "it is no checkpoint of `wodtem train`");
         require_same_settings(settings_from_text(file.text("settings"), path), settings, path);
         Loader loader{file};
         folder.visit(loader);
         visit(loader);
     } catch (const Error& error) {
-        fail(error.id.c_str(), "%s cannot be used: %s; remove it to start this run anew", path.c_str(), error.what());
+        throw Error(error.id, path + " cannot be used: " + error.what() + "; remove it to start this run anew");
     }
 }
 

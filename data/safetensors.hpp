@@ -17,6 +17,7 @@
 #include <optional>
 #include <ranges>
 #include <span>
+#include <sstream>
 #include <string_view>
 
 #include "../nn.hpp"  // and with it the other standard headers
@@ -24,17 +25,20 @@
 static_assert(std::endian::native == std::endian::little, "tensors are copied as they lie in memory");
 static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
 
+// Returns the parts, one after the other: texts, whole numbers, and other numbers to six digits.
+std::string text_of(const auto&... parts) {
+    std::ostringstream text;
+    (text << ... << parts);
+    return text.str();
+}
+
+// Fails unless the condition holds. The sentence is text_of(parts...).
+void require(bool holds, const char* id, const auto&... parts) {
+    if (!holds) throw Error(id, text_of(parts...));
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Files
-
-struct FileDescriptor {
-    int fd;
-    explicit FileDescriptor(int opened) : fd(opened) {}
-    FileDescriptor(FileDescriptor&&) = delete;  // nor are there copies
-    ~FileDescriptor() {
-        if (fd >= 0) ::close(fd);
-    }
-};
 
 // Fails with the reason that errno holds, so the caller calls it at once after the failure.
 [[noreturn]] inline void fail_file(const char* id, const char* action, const std::string& path) {
@@ -42,46 +46,42 @@ struct FileDescriptor {
 }
 
 // An open file. Its functions fail with file.read and file.write.
-struct File : FileDescriptor {
+struct File {
     std::string path;
+    int fd;
 
     // Errors: `id`. O_NONBLOCK: opening a named pipe must not wait for its other end.
     File(const std::string& name, int flags, const char* id, const char* action)
-        : FileDescriptor(::open(name.c_str(), flags | O_CLOEXEC | O_NONBLOCK, 0666)),
-          path(name) {
+        : path(name),
+          fd(::open(name.c_str(), flags | O_CLOEXEC | O_NONBLOCK, 0666)) {
         if (fd < 0) fail_file(id, action, path);
     }
+    File(File&&) = delete;  // nor are there copies
+    ~File() { ::close(fd); }
+
     // Returns the size in bytes of a regular file. Errors: file.not_regular for a folder, pipe or device.
     size_t size() const {
         struct stat status {};
         if (::fstat(fd, &status) != 0) fail_file("file.read", "ask for its size", path);
-        if (!S_ISREG(status.st_mode))
-            fail("file.not_regular", "%s: is not a regular file; give a file's path", path.c_str());
+        require(S_ISREG(status.st_mode), "file.not_regular", path, ": is not a regular file; give a file's path");
         return static_cast<size_t>(status.st_size);
     }
-    // The `count` bytes at an offset, or fewer at the file's end. Errors: file.read.
-    std::string peek(size_t at, size_t count) const {
-        std::string bytes(count, '\0');
+    // Reads the `count` bytes at an offset, or fewer where the file ends or the system says so. Returns how many.
+    size_t read_at(size_t at, char* to, size_t count) const {
         ssize_t got = 0;
-        do got = ::pread(fd, bytes.data(), count, static_cast<off_t>(at));
+        do got = ::pread(fd, to, count, static_cast<off_t>(at));
         while (got < 0 && errno == EINTR);
         if (got < 0) fail_file("file.read", "read it", path);
-        bytes.resize(static_cast<size_t>(got));
-        return bytes;
+        return static_cast<size_t>(got);
     }
     // Makes `bytes` hold the file's first `count` bytes, of which it may hold the first ones already.
     // Errors: file.too_large, before anything is allocated; file.read.
     void read(std::string& bytes, size_t count, size_t limit = size_t{1} << 36) const {
-        if (count > limit)
-            fail("file.too_large", "%s: has %zu bytes, at most %zu are read", path.c_str(), count, limit);
-        size_t done = bytes.size();
-        bytes.resize(count);
-        while (done < count) {
-            const ssize_t got = ::read(fd, bytes.data() + done, count - done);
-            if (got < 0 && errno == EINTR) continue;
-            if (got < 0) fail_file("file.read", "read it", path);
-            if (got == 0) fail("file.read", "%s: shrank while it was read (%zu bytes); try again", path.c_str(), count);
-            done += static_cast<size_t>(got);
+        require(count <= limit, "file.too_large", path, ": has ", count, " bytes, at most ", limit, " are read");
+        size_t done = bytes.size(), got = 0;
+        for (bytes.resize(count); done < count; done += got) {
+            got = read_at(done, bytes.data() + done, count - done);
+            require(got > 0, "file.read", path, ": shrank while it was read (", count, " bytes); try again");
         }
     }
     // This is the only call of write(), which may be interrupted and may take fewer bytes than it was given (POSIX).
@@ -114,21 +114,19 @@ inline std::string written_path(const std::string& path) {
     std::error_code none;  // what cannot be looked at is not there; creating it then says why
     fs::path at = path;
     for (int links = 0; fs::is_symlink(at, none); ++links) {
-        if (links == 40) fail("file.write", "%s: its symbolic links lead in a circle", path.c_str());
+        require(links < 40, "file.write", path, ": its symbolic links lead in a circle");
         at = at.parent_path() / fs::read_symlink(at, none);
     }
-    if (fs::exists(at, none) && !fs::is_regular_file(at, none))
-        fail("file.not_regular", "%s: is not a regular file; it is left as it is, give another path to write to",
-             path.c_str());
+    require(!fs::exists(at, none) || fs::is_regular_file(at, none), "file.not_regular", path,
+            ": is not a regular file; it is left as it is, give another path to write to");
     return at;
 }
 
 // Errors: file.input, if writing to `out` would replace the file `input`; those of written_path().
 inline void require_other_file(const std::string& out, const std::string& input) {
     std::error_code none;
-    if (std::filesystem::equivalent(written_path(out), input, none))
-        fail("file.input", "%s: is the file %s that is read; give another path to write to", out.c_str(),
-             input.c_str());
+    require(!std::filesystem::equivalent(written_path(out), input, none), "file.input", out, ": is the file ", input,
+            " that is read; give another path to write to");
 }
 
 // A file that appears as a whole: other programs see the old file or the complete new one. Bytes go to PATH.N.tmp,
@@ -178,31 +176,28 @@ inline void remove_temporaries(const std::string& folder) {
     std::error_code none;
     std::vector<std::filesystem::path> found;
     for (const auto& entry : std::filesystem::directory_iterator(folder, none)) {
-        const std::filesystem::path number = entry.path().stem().extension();  // of NAME.N.tmp: ".N"
-        const std::string digits = number.string().substr(std::min<size_t>(number.string().size(), 1));
-        const bool all_digits = digits.find_first_not_of("0123456789") == std::string::npos;
-        if (entry.path().extension() == ".tmp" && !digits.empty() && all_digits) found.push_back(entry.path());
+        const std::string number = entry.path().stem().extension();  // of NAME.N.tmp: ".N"
+        const bool digits = number.size() > 1 && number.find_first_not_of("0123456789", 1) == std::string::npos;
+        if (digits && entry.path().extension() == ".tmp") found.push_back(entry.path());
     }
     for (const std::filesystem::path& temporary : found) std::filesystem::remove(temporary, none);
 }
 
-// A log that grows. append() gives text to the system at once (no buffer), sync() brings it to the disk. A checkpoint
+// A log that grows. write() gives text to the system at once (no buffer), sync() brings it to the disk. A checkpoint
 // notes the size after sync(); a run that continues from the checkpoint gives that size to truncate_file first.
 struct AppendFile : File {
     explicit AppendFile(const std::string& name)
         : File(name, O_WRONLY | O_CREAT | O_APPEND, "file.open", "open it for writing") {
         size();
     }
-    void append(std::string_view text) const { write(text); }
 };
 
 // Drops what a log gained after the checkpoint that noted `size` bytes. Errors: file.open, file.shorter, file.write.
 inline void truncate_file(const std::string& path, size_t size) {
     const File file(path, O_WRONLY, "file.open", "open it for writing");
     const size_t found = file.size();
-    if (found < size)
-        fail("file.shorter", "%s: has %zu bytes, the checkpoint was saved when it had %zu; restore it or start anew",
-             path.c_str(), found, size);
+    require(found >= size, "file.shorter", path, ": has ", found, " bytes, the checkpoint was saved when it had ", size,
+            "; restore it or start anew");
     if (::ftruncate(file.fd, static_cast<off_t>(size)) != 0) fail_file("file.write", "shorten it", path);
     file.sync();
 }
@@ -326,9 +321,8 @@ inline std::string tensor_place(const std::string& path, const std::string& name
 
 // Errors: safetensors.name, so that every name can be printed on a terminal as it is.
 inline void check_name(const std::string& name, const std::string& path) {
-    if (name == "__metadata__" || has_control(name))
-        fail("safetensors.name", "%s: cannot have this name: no control characters, not __metadata__",
-             tensor_place(path, name).c_str());
+    require(name != "__metadata__" && !has_control(name), "safetensors.name", tensor_place(path, name),
+            ": cannot have this name: no control characters, not __metadata__");
 }
 
 struct StoredTensor {
@@ -356,33 +350,29 @@ struct TensorFile {
     // Errors: safetensors.missing.
     const StoredTensor& find(const std::string& name) const {
         const auto found = index.find(name);
-        if (found == index.end())
-            fail("safetensors.missing", "%s: is not among the %zu tensors; is it a file of this kind?",
-                 tensor_place(path, name).c_str(), tensors.size());
+        require(found != index.end(), "safetensors.missing", tensor_place(path, name), ": is not among the ",
+                tensors.size(), " tensors; is it a file of this kind?");
         return tensors[found->second];
     }
 
     // Returns a metadata entry. Errors: safetensors.missing.
     const std::string& text(const std::string& key) const {
         const auto found = metadata.find(key);
-        if (found == metadata.end())
-            fail("safetensors.missing", "%s: has no metadata entry %s; is it a file of this kind?", path.c_str(),
-                 json_string(key).c_str());
+        require(found != metadata.end(), "safetensors.missing", path, ": has no metadata entry ", json_string(key),
+                "; is it a file of this kind?");
         return found->second;
     }
 
     // Copies `values` (vector, span or array; row-major) to the end. A scalar: add("step", {}, std::array{n}).
     // Errors: safetensors.name, safetensors.shape, safetensors.duplicate_name.
-    template <std::ranges::contiguous_range Values>
-    void add(const std::string& name, const Shape& shape, const Values& values) {
+    void add(const std::string& name, const Shape& shape, const std::ranges::contiguous_range auto& values) {
         const std::span given(std::ranges::data(values), std::ranges::size(values));
-        constexpr DType dtype = dtype_of<std::ranges::range_value_t<Values>>();
+        constexpr DType dtype = dtype_of<typename decltype(given)::value_type>();
+        const std::string place = tensor_place(path, name);
         check_name(name, path);
-        if (byte_size(shape, dtype) != given.size_bytes())
-            fail("safetensors.shape", "%s: has shape %s and was given %zu elements", tensor_place(path, name).c_str(),
-                 shape_text(shape).c_str(), given.size());
-        if (!index.emplace(name, tensors.size()).second)
-            fail("safetensors.duplicate_name", "%s: was added twice", tensor_place(path, name).c_str());
+        require(byte_size(shape, dtype) == given.size_bytes(), "safetensors.shape", place, ": has shape ",
+                shape_text(shape), " and was given ", given.size(), " elements");
+        require(index.emplace(name, tensors.size()).second, "safetensors.duplicate_name", place, ": was added twice");
         tensors.push_back({name, dtype, shape, data().size(), given.size_bytes()});
         if (!given.empty()) buffer.append(reinterpret_cast<const char*>(given.data()), given.size_bytes());
     }
@@ -392,13 +382,12 @@ struct TensorFile {
     template <class T>
     void read_into(std::span<T> out, const std::string& name, const Shape& shape) const {
         const StoredTensor& tensor = find(name);
-        if (tensor.dtype != dtype_of<T>())
-            fail("safetensors.dtype", "%s has dtype %s, expected %s", tensor_place(path, name).c_str(),
-                 about(tensor.dtype).name, about(dtype_of<T>()).name);
-        if (tensor.shape != shape || tensor.size != out.size_bytes())
-            fail("safetensors.shape", "%s has shape %s, expected %s (%zu elements); made with other settings?",
-                 tensor_place(path, name).c_str(), shape_text(tensor.shape).c_str(), shape_text(shape).c_str(),
-                 out.size());
+        const std::string place = tensor_place(path, name);
+        require(tensor.dtype == dtype_of<T>(), "safetensors.dtype", place, " has dtype ", about(tensor.dtype).name,
+                ", expected ", about(dtype_of<T>()).name);
+        require(tensor.shape == shape && tensor.size == out.size_bytes(), "safetensors.shape", place, " has shape ",
+                shape_text(tensor.shape), ", expected ", shape_text(shape), " (", out.size(),
+                " elements); made with other settings?");
         if (!out.empty()) std::memcpy(out.data(), bytes(tensor).data(), tensor.size);  // the file need not be aligned
     }
 
@@ -447,16 +436,14 @@ inline std::string file_start(const TensorFile& file) {
     for (const StoredTensor& tensor : file.tensors) {
         out += "," + json_string(tensor.name) + ":{\"dtype\":\"" + about(tensor.dtype).name + "\",\"shape\":[";
         for (size_t i = 0; i < tensor.shape.size(); ++i) out += (i > 0 ? "," : "") + std::to_string(tensor.shape[i]);
-        const size_t end = tensor.begin + tensor.size;
-        out += "],\"data_offsets\":[" + std::to_string(tensor.begin) + "," + std::to_string(end) + "]}";
+        out += text_of("],\"data_offsets\":[", tensor.begin, ",", tensor.begin + tensor.size, "]}");
     }
     out += "}";
     out.resize((out.size() + 7) / 8 * 8, ' ');
     const size_t length = out.size() - 8;
     const bool reserved = file.metadata.contains("crc32.header") || file.metadata.contains("crc32.tensors");
-    if (length > header_limit || reserved || !is_utf8(std::string_view(out).substr(8)))
-        fail("safetensors.metadata", "%s: names and metadata (%zu bytes) must be UTF-8, below 100 MB, without crc32.*",
-             file.path.c_str(), length);
+    require(length <= header_limit && !reserved && is_utf8(std::string_view(out).substr(8)), "safetensors.metadata",
+            file.path, ": names and metadata (", length, " bytes) must be UTF-8, below 100 MB, without crc32.*");
     std::memcpy(out.data(), &length, 8);
     out.replace(crc_at, 8, header_checksum(out));
     return out;
@@ -477,9 +464,9 @@ struct HeaderReader {
     const std::string& path;
     size_t at = 8;  // next byte; messages give it as the offset in the file
 
-    [[noreturn]] void expected(const char* what) const {
-        fail("safetensors.json", "%s: offset %zu: expected %s; the file is damaged or is not safetensors", path.c_str(),
-             at, what);
+    void expect(bool holds, std::string_view what) const {
+        require(holds, "safetensors.json", path, ": offset ", at, ": expected ", what,
+                "; the file is damaged or is not safetensors");
     }
     void skip_space() { at = std::min(file.find_first_not_of(" \t\r\n", at), file.size()); }
     bool take(char c) {
@@ -488,21 +475,19 @@ struct HeaderReader {
         at += found ? 1 : 0;
         return found;
     }
-    void need(char c) {
-        if (!take(c)) expected(std::string(1, c).c_str());
-    }
+    void need(char c) { expect(take(c), {&c, 1}); }
 
     // Returns what an escape stands for, as UTF-8. Surrogate pairs are refused: other programs write characters above
     // U+FFFF as UTF-8.
     std::string escape() {
         const size_t which = std::string_view("\"\\/bfnrtu").find(at < file.size() ? file[at++] : '?');
-        if (which == std::string_view::npos) expected("one of \" \\ / b f n r t u after \\");
+        expect(which != std::string_view::npos, "one of \" \\ / b f n r t u after \\");
         if (which < 8) return {"\"\\/\b\f\n\r\t"[which]};
         uint32_t code = 0;
         const std::string_view digits = file.substr(at, 4);
         const char* end = digits.data() + digits.size();
-        if (std::from_chars(digits.data(), end, code, 16).ptr != end || digits.size() < 4) expected("4 hex digits");
-        if (code >> 11 == 0xD800 >> 11) expected("no surrogate");
+        expect(std::from_chars(digits.data(), end, code, 16).ptr == end && digits.size() == 4, "4 hex digits");
+        expect(code >> 11 != 0xD800 >> 11, "no surrogate");
         at += 4;
         const char last = static_cast<char>(0x80 | (code & 0x3F));
         if (code < 0x80) return {static_cast<char>(code)};
@@ -513,7 +498,7 @@ struct HeaderReader {
         need('"');
         std::string out;
         while (true) {
-            if (at >= file.size() || static_cast<uint8_t>(file[at]) < 0x20) expected("the end of a string");
+            expect(at < file.size() && static_cast<uint8_t>(file[at]) >= 0x20, "the end of a string");
             const char c = file[at++];
             if (c == '"') return out;
             out += c == '\\' ? escape() : std::string(1, c);
@@ -524,14 +509,13 @@ struct HeaderReader {
         uint64_t value = 0;
         const char* begin = file.data() + at;
         const auto [end, error] = std::from_chars(begin, file.data() + file.size(), value);
-        if (error != std::errc()) expected("a whole number from 0 to 2^64 - 1");
-        if (*begin == '0' && end - begin > 1) expected("a number without leading zeros");
+        expect(error == std::errc(), "a whole number from 0 to 2^64 - 1");
+        expect(*begin != '0' || end - begin == 1, "a number without leading zeros");
         at += static_cast<size_t>(end - begin);
         return value;
     }
     // Reads items separated by commas between two brackets.
-    template <class Item>
-    void list(char open, char close, const Item& item) {
+    void list(char open, char close, const auto& item) {
         need(open);
         if (take(close)) return;
         do item();
@@ -544,14 +528,12 @@ struct HeaderReader {
         return out;
     }
     // Calls member(key) with the reader at each value; member returns false if the key came before.
-    template <class Member>
-    void object(const Member& member) {
+    void object(const auto& member) {
         list('{', '}', [&] {
             const std::string key = string();
             need(':');
-            if (!member(key))
-                fail("safetensors.duplicate_name", "%s: offset %zu: the name %s came before", path.c_str(), at,
-                     json_string(key.substr(0, 80)).c_str());
+            require(member(key), "safetensors.duplicate_name", path, ": offset ", at, ": the name ",
+                    json_string(key.substr(0, 80)), " came before");
         });
     }
 };
@@ -559,8 +541,8 @@ struct HeaderReader {
 inline DType dtype_named(const std::string& dtype, const std::string& place) {
     for (size_t i = 0; i < std::size(dtypes); ++i)
         if (dtype == dtypes[i].name) return static_cast<DType>(i);
-    fail("safetensors.dtype", "%s has dtype %s, known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first",
-         place.c_str(), json_string(dtype.substr(0, 80)).c_str());
+    throw Error("safetensors.dtype", place + " has dtype " + json_string(dtype.substr(0, 80)) +
+                                         ", known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first");
 }
 
 // Reads {"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}. std::exchange() returns what the field held before, so a
@@ -573,17 +555,15 @@ inline StoredTensor read_entry(HeaderReader& reader, const std::string& name) {
     reader.object([&](const std::string& field) {
         if (field == "dtype") return !std::exchange(dtype, dtype_named(reader.string(), place));
         if (field == "shape") return !std::exchange(shape, reader.integers());
-        if (field == "data_offsets") return !std::exchange(offsets, reader.integers());
-        reader.expected("dtype, shape or data_offsets");
+        reader.expect(field == "data_offsets", "dtype, shape or data_offsets");
+        return !std::exchange(offsets, reader.integers());
     });
-    if (!dtype || !shape || !offsets || offsets->size() != 2)
-        reader.expected("dtype, shape and two data_offsets before this");
+    const bool complete = dtype && shape && offsets && offsets->size() == 2;
+    reader.expect(complete, "dtype, shape and two data_offsets before this");
     const size_t begin = offsets->front(), end = offsets->back();
-    if (begin > end)
-        fail("safetensors.offsets", "%s: data_offsets %zu, %zu end before they begin", place.c_str(), begin, end);
-    if (byte_size(*shape, *dtype) != end - begin)
-        fail("safetensors.shape", "%s: shape %s of %s does not fill data_offsets %zu, %zu", place.c_str(),
-             shape_text(*shape).c_str(), about(*dtype).name, begin, end);
+    require(begin <= end, "safetensors.offsets", place, ": data_offsets ", begin, ", ", end, " end before they begin");
+    require(byte_size(*shape, *dtype) == end - begin, "safetensors.shape", place, ": shape ", shape_text(*shape),
+            " of ", about(*dtype).name, " does not fill data_offsets ", begin, ", ", end);
     return {name, *dtype, *shape, begin, end - begin};
 }
 
@@ -595,17 +575,14 @@ inline void check_layout(TensorFile& file, size_t available) {
     size_t next = 0;
     for (const StoredTensor& tensor : file.tensors) {
         const std::string place = tensor_place(file.path, tensor.name);
-        if (tensor.begin != next)
-            fail("safetensors.offsets", "%s: begins at data offset %zu, expected %zu: %s", place.c_str(), tensor.begin,
-                 next, tensor.begin < next ? "tensors overlap" : "there is a hole");
-        if (tensor.size > available - next)
-            fail("safetensors.truncated", "%s at byte %zu: needs %zu bytes of data, %zu are left; the file was cut off",
-                 place.c_str(), file.data_start + next, tensor.size, available - next);
+        require(tensor.begin == next, "safetensors.offsets", place, ": begins at data offset ", tensor.begin,
+                ", expected ", next, ": ", tensor.begin < next ? "tensors overlap" : "there is a hole");
+        require(tensor.size <= available - next, "safetensors.truncated", place, " at byte ", file.data_start + next,
+                ": needs ", tensor.size, " bytes of data, ", available - next, " are left; the file was cut off");
         next += tensor.size;
     }
-    if (next != available)
-        fail("safetensors.trailing", "%s: %zu bytes follow the last tensor; the file is damaged", file.path.c_str(),
-             available - next);
+    require(next == available, "safetensors.trailing", file.path, ": ", available - next,
+            " bytes follow the last tensor; the file is damaged");
 }
 
 // Checks and removes this program's two metadata entries. Errors: safetensors.checksum.
@@ -615,45 +592,37 @@ inline void check_checksums(TensorFile& file) {
     const std::string_view start = std::string_view(file.buffer).substr(0, file.data_start);
     const bool complete = stored && tensors && start.substr(8).starts_with(header_start) &&
                           tensors.mapped().size() == 8 * file.tensors.size();
-    if (!complete || start.substr(crc_at, 8) != header_checksum(start))
-        fail("safetensors.checksum",
-             "%s: the header does not match its checksum; the file is damaged (a program that rewrites it must "
-             "drop the metadata entries crc32.header and crc32.tensors)",
-             file.path.c_str());
+    require(complete && start.substr(crc_at, 8) == header_checksum(start), "safetensors.checksum", file.path,
+            ": the header does not match its checksum; the file is damaged (a program that rewrites it must "
+            "drop the metadata entries crc32.header and crc32.tensors)");
     file.has_checksums = true;
     for (size_t i = 0; i < file.tensors.size(); ++i) {
         const std::string found = hex8(crc32(file.bytes(file.tensors[i])));
         const std::string expected = tensors.mapped().substr(8 * i, 8);
-        if (found != expected)
-            fail("safetensors.checksum", "%s has CRC-32 %s, expected %s; the file is damaged, use another copy",
-                 tensor_place(file.path, file.tensors[i].name).c_str(), found.c_str(), expected.c_str());
+        require(found == expected, "safetensors.checksum", tensor_place(file.path, file.tensors[i].name),
+                " has CRC-32 ", found, ", expected ", expected, "; the file is damaged, use another copy");
     }
 }
 
 // Reads a file of `size` bytes, its header before its data, so that a file of another kind is refused by its first
 // bytes. read(buffer, n) makes `buffer` hold the first n bytes; `path` is for messages. Errors: those of read();
 // safetensors.truncated, .header_length, .json, .name, .duplicate_name, .dtype, .shape, .offsets, .trailing, .checksum.
-template <class Read>
-TensorFile parse_safetensors(size_t size, const std::string& path, Read&& read) {
+TensorFile parse_safetensors(size_t size, const std::string& path, const auto& read) {
     TensorFile file;
     file.path = path;
     size_t length = 0;
-    if (size < 8)
-        fail("safetensors.truncated", "%s: offset 0: %zu bytes are too few for a header length", path.c_str(), size);
+    require(size >= 8, "safetensors.truncated", path, ": offset 0: ", size, " bytes are too few for a header length");
     read(file.buffer, 8);
     std::memcpy(&length, file.buffer.data(), 8);
-    if (length > header_limit)
-        fail("safetensors.header_length", "%s: offset 0: header length %zu is above %zu; not a safetensors file?",
-             path.c_str(), length, header_limit);
-    if (length > size - 8)
-        fail("safetensors.truncated",
-             "%s: offset 8: the header should have %zu bytes, %zu follow; the file was cut off", path.c_str(), length,
-             size - 8);
+    require(length <= header_limit, "safetensors.header_length", path, ": offset 0: header length ", length,
+            " is above ", header_limit, "; not a safetensors file?");
+    require(length <= size - 8, "safetensors.truncated", path, ": offset 8: the header should have ", length,
+            " bytes, ", size - 8, " follow; the file was cut off");
     file.data_start = 8 + length;
     read(file.buffer, file.data_start);
 
     HeaderReader reader{std::string_view(file.buffer).substr(0, file.data_start), path};
-    if (!is_utf8(reader.file.substr(8))) reader.expected("a header in UTF-8");
+    reader.expect(is_utf8(reader.file.substr(8)), "a header in UTF-8");
     reader.object([&](const std::string& name) {
         if (name != "__metadata__")
             file.tensors.push_back(read_entry(reader, name));
@@ -662,7 +631,7 @@ TensorFile parse_safetensors(size_t size, const std::string& path, Read&& read) 
         return file.index.emplace(name, 0).second;
     });
     reader.skip_space();
-    if (reader.at != file.data_start) reader.expected("spaces up to the end of the header");
+    reader.expect(reader.at == file.data_start, "spaces up to the end of the header");
 
     check_layout(file, size - file.data_start);
     read(file.buffer, size);
@@ -687,9 +656,8 @@ inline TensorFile read_safetensors(const std::string& path) {
 // A file that this program alone writes: its checksums must be there. Errors: safetensors.unchecked beside the above.
 inline TensorFile read_own_safetensors(const std::string& path) {
     TensorFile file = read_safetensors(path);
-    if (!file.has_checksums)
-        fail("safetensors.unchecked", "%s: lacks the metadata entries crc32.header and crc32.tensors, its checksums",
-             path.c_str());
+    require(file.has_checksums, "safetensors.unchecked", path,
+            ": lacks the metadata entries crc32.header and crc32.tensors, its checksums");
     return file;
 }
 
@@ -704,10 +672,7 @@ struct Saver {
     void operator()(const std::string& name, const std::vector<T>& values, std::optional<size_t> size = {}) {
         file.add(name, {size.value_or(values.size())}, values);
     }
-    template <class T>
-    void operator()(const std::string& name, const T& value) {
-        file.add(name, {}, std::array{value});
-    }
+    void operator()(const std::string& name, const auto& value) { file.add(name, {}, std::array{value}); }
 };
 
 // Errors: those of TensorFile::read_into.
@@ -721,8 +686,7 @@ struct Loader {
         values.resize(size.value_or(values.empty() ? stored : values.size()));
         file.read_into(std::span<T>(values), name, {values.size()});
     }
-    template <class T>
-    void operator()(const std::string& name, T& value) {
-        value = file.get<T>(name, {})[0];
+    void operator()(const std::string& name, auto& value) {
+        value = file.get<std::remove_reference_t<decltype(value)>>(name, {})[0];
     }
 };

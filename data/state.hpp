@@ -28,8 +28,7 @@ inline void require_actions(const std::string& entry, const std::vector<float>& 
 // Visits trained parameters and the state of their optimiser: "NAME.updates", then for each parameter "NAME.value.P",
 // "NAME.first_moment.P" and "NAME.second_moment.P". Values are loaded in place, because tensors point at them; moments
 // that no update has touched yet are saved as zeros. Errors: checkpoint.entry.
-template <class Archive>
-void visit_trained(Archive& archive, const std::string& name, std::vector<Parameter<float>>& parameters,
+void visit_trained(auto& archive, const std::string& name, std::vector<Parameter<float>>& parameters,
                    Optimizer& optimizer) {
     archive(name + ".updates", optimizer.updates);
     optimizer.first_moment.resize(parameters.size());
@@ -54,8 +53,7 @@ void visit_trained(Archive& archive, const std::string& name, std::vector<Parame
 
 // Visits states [steps, state_dim], actions [steps, action_dim] and rewards [steps] of all trajectories, and each one's
 // length and end. moves: see require_actions(). Errors: checkpoint.entry.
-template <class Archive>
-void visit_replay(Archive& archive, ReplayBuffer& replay, int moves) {
+void visit_replay(auto& archive, ReplayBuffer& replay, int moves) {
     std::vector<float> states, actions, rewards;
     std::vector<uint32_t> lengths, terminated;
     const auto append = [](auto& all, const auto& part) { all.insert(all.end(), part.begin(), part.end()); };
@@ -112,8 +110,7 @@ void visit_replay(Archive& archive, ReplayBuffer& replay, int moves) {
 // The episodic memory: its columns; everything else is derived from them.
 
 // moves: see require_actions(). Errors: checkpoint.entry.
-template <class Archive>
-void visit_memory(Archive& archive, EpisodicMemory& memory, int moves) {
+void visit_memory(auto& archive, EpisodicMemory& memory, int moves) {
     EpisodicMemory::for_each_column(memory, [&](const char* name, auto& column, size_t) { archive(name, column); });
     archive("memory.projection", memory.projection);
     archive("memory.accesses", memory.accesses);
@@ -150,8 +147,7 @@ void visit_memory(Archive& archive, EpisodicMemory& memory, int moves) {
 }
 
 // Refuses a temperature, a normaliser and counts that no run can have saved. Errors: checkpoint.entry.
-template <class Run>
-void check_state(Run& run) {
+void check_state(auto& run) {
     require_finite("temperature.value.log_temperature", std::array{run.agent.temperature.lambda()});
     require_finite("normaliser.mean", run.agent.normaliser.mean);
     require_finite("normaliser.deviation", run.agent.normaliser.deviation);

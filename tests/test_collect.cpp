@@ -491,8 +491,8 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     CHECK(file.find("metadata/policy/fc0/weight")->shape == (Shape{256, 111}));
     CHECK(file.find("metadata/policy/last_fc_log_std/weight")->shape == (Shape{8, 256}));
     // The stored network, given whole observations, says what the played one said of the actions taken.
-    const std::vector<float> weights = file.read_floats(*file.find("metadata/policy/fc0/weight")),
-                             log_probs = file.read_floats(*file.find("infos/action_log_probs"));
+    const std::vector<float> weights = file.read<float>(*file.find("metadata/policy/fc0/weight")),
+                             log_probs = file.read<float>(*file.find("infos/action_log_probs"));
     for (size_t unit = 0; unit < 256; ++unit)
         for (size_t i = 0; i < 111; ++i)
             CHECK_EQUAL(weights[111 * unit + i], i < 27 ? network.parameters[0].value[27 * unit + i] : 0.0f);

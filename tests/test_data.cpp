@@ -347,7 +347,7 @@ TEST(of_two_writers_of_one_file_the_last_to_finish_wins) {
     CHECK(folder.names() == std::set<std::string>{"file"});
 
     for (const char* name : {"file.123.tmp", "file.tmp", "123.tmp", "notes.v1.tmp", "x.y.7.tmp"})
-        AppendFile(folder / name).append("x");
+        AppendFile(folder / name).write("x");
     remove_temporaries(folder.path);  // what a killed process left, and no other file
     CHECK(folder.names() == (std::set<std::string>{"file", "file.tmp", "123.tmp", "notes.v1.tmp"}));
     remove_temporaries(folder / "missing");
@@ -369,14 +369,14 @@ TEST(log_continues_from_the_size_that_the_checkpoint_noted) {
     size_t noted = 0;
     {
         const AppendFile log(path);
-        log.append("step,return\n");
+        log.write("step,return\n");
         log.sync();
         noted = log.size();
-        log.append("1000,5\n");
+        log.write("1000,5\n");
     }
     CHECK_EQUAL(read_file(path), "step,return\n1000,5\n");
     truncate_file(path, noted);
-    AppendFile(path).append("1000,6\n");
+    AppendFile(path).write("1000,6\n");
     CHECK_EQUAL(read_file(path), "step,return\n1000,6\n");
     CHECK_FAILS("file.shorter", truncate_file(path, 1000));
     CHECK_FAILS("file.open", truncate_file(folder / "missing", 0));
