@@ -865,6 +865,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     ModelContents contents = contents_of(run.agent);
     contents.updates = run.progress.updates;
     contents.interactions = run.progress.interactions;
+    contents.evaluations = run.progress.evaluations;
     save_model(contents, folder.file("model.safetensors"));
     if (settings.task == "gridworld") save_grid_results(run, folder);
     write_file_atomic(folder.file("finished"), "");
@@ -891,12 +892,11 @@ void command_train(const Arguments& arguments) {
     }
 }
 
-// The network, the normaliser and the settings come from the model file; neither memory nor buffer is built.
+// The network, the normaliser and the settings come from the model file; neither memory nor buffer is built. Without
+// --seed it is the run's last evaluation again, episode for episode.
 void command_eval(const Arguments& arguments) {
     const TensorFile file = open_model(arguments.words[0]);
-    Settings settings = settings_in(file);
-    if (settings.task != "gridworld") settings.mujoco = mujoco_version();  // of the library that steps the bodies here
-    settings.eval_episodes = whole_number(arguments["--episodes"], "--episodes", 1, 10000);
+    const Settings settings = evaluated_settings(arguments, settings_in(file));
     Agent agent(settings, spec_of(settings));
     ModelContents contents = contents_of(agent);
     load_model(contents, file);
@@ -904,7 +904,8 @@ void command_eval(const Arguments& arguments) {
     Tape<float> acting(compute);
     acting.recording = false;
     const Environments environments(*make_environment(settings), settings.eval_episodes);
-    const Evaluation evaluation = evaluate(agent, acting, environments.all(), 0);
+    const uint64_t number = arguments.has("--seed") ? 0 : std::max<uint64_t>(1, contents.evaluations) - 1;
+    const Evaluation evaluation = evaluate(agent, acting, environments.all(), number);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
 }
 

@@ -37,7 +37,9 @@ inline const Option option_table[] = {
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
     {"train", "--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"},
-    {"eval", "--episodes", "N", "1", "episodes"},
+    {"eval", "--episodes", "N", "", "episodes (default: as many as the run's evaluations have)"},
+    {"eval", "--seed", "N", "", "of the starts (default: the starts of the run's last evaluation)"},
+    {"eval", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
     {"export", "--odt", nullptr, "",
      "for load_state_dict(strict=True) of ODT's own code: its names, its unused tensors"},
     {"import", "--task", "ID", "", "whose network it is; not needed if `wodtem export` made the file"},
@@ -313,6 +315,20 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
     settings.arithmetic = kernel_of(arguments).arithmetic;
+    return settings;
+}
+
+// The settings of a model with what `eval` was told to change. Errors: usage.*.
+inline Settings evaluated_settings(const Arguments& arguments, Settings settings) {
+    if (settings.task != "gridworld") settings.mujoco = mujoco_version();  // of the library that steps the bodies here
+    if (arguments.has("--episodes"))
+        settings.eval_episodes = whole_number(arguments["--episodes"], "--episodes", 1, 10000);
+    if (arguments.has("--seed")) settings.seed = whole_number(arguments["--seed"], "--seed", 0, 4294967295);
+    for (const std::string& assignment : arguments.assignments)
+        if (!assignment.starts_with("g_eval=") && !assignment.starts_with("eval_context="))
+            fail("usage.setting", "eval takes --set g_eval=X and --set eval_context=N; \"%s\" is the model's own",
+                 assignment.c_str());
+    apply_assignments(settings, arguments.assignments);
     return settings;
 }
 

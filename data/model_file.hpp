@@ -1,10 +1,10 @@
 // model_file.hpp: a trained model as a safetensors file, and the same weights under the names of ODT's own code.
 //
 // A model file holds the network's parameters under ODT's names, `log_temperature` [], `state_mean` and `state_std`
-// [state_dim], and in its metadata the format, the settings and the counts of updates and interactions: all that `eval`
-// needs. A file for ODT's code holds exactly what a strict load_state_dict of its model expects, that is also tensors
-// which it neither trains nor uses; what it has no place for goes into the metadata, as decimal text that reads back
-// exactly.
+// [state_dim], and in its metadata the format, the settings and the counts of updates, interactions and evaluations:
+// all that `eval` needs. A file for ODT's code holds exactly what a strict load_state_dict of its model expects, that
+// is also tensors which it neither trains nor uses; what it has no place for goes into the metadata, as decimal text
+// that reads back exactly.
 // Promises: a file is checked against the network of its settings before anything of it is used; errors name the file
 // and the tensor. Leaves out: moments, replay buffer and memory (run_folder.hpp's checkpoint).
 #pragma once
@@ -19,7 +19,7 @@ struct ModelContents {
     std::vector<Parameter<float>>& parameters;
     Parameter<float>& log_temperature;
     std::vector<float>&state_mean, &state_std;  // [config.state_dim]
-    uint64_t updates = 0, interactions = 0;
+    uint64_t updates = 0, interactions = 0, evaluations = 0;
 };
 
 // What model files and files for ODT's code have in common: the metadata and the network's parameters.
@@ -28,7 +28,8 @@ inline TensorFile network_file(const ModelContents& model, const char* format) {
     file.metadata = {{"format", format},
                      {"settings", settings_text(model.settings)},
                      {"updates", std::to_string(model.updates)},
-                     {"interactions", std::to_string(model.interactions)}};
+                     {"interactions", std::to_string(model.interactions)},
+                     {"evaluations", std::to_string(model.evaluations)}};
     for (const Parameter<float>& parameter : model.parameters)
         file.add(parameter.name, parameter.shape, parameter.value);
     return file;
@@ -100,10 +101,28 @@ inline void load_counts(ModelContents& model, const TensorFile& file) {
     };
     model.updates = count("updates");
     model.interactions = count("interactions");
+    model.evaluations = count("evaluations");
 }
 
-// Reads what save_model() wrote. Errors: model.names, model.value, import.metadata, safetensors.*.
+inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";  // of run_folder.hpp
+
+// Reads the network of an unfinished run from its checkpoint. Errors: model.value, safetensors.*.
+inline void load_unfinished(ModelContents& model, const TensorFile& file) {
+    const uint64_t state_dim = static_cast<uint64_t>(model.config.state_dim);
+    for (Parameter<float>& parameter : model.parameters)
+        file.read_into(std::span(parameter.value), "model.value." + parameter.name, {parameter.value.size()});
+    file.read_into(std::span(model.log_temperature.value), "temperature.value.log_temperature", {1});
+    model.state_mean = file.get<float>("normaliser.mean", {state_dim});
+    model.state_std = file.get<float>("normaliser.deviation", {state_dim});
+    check_model(model, file.path);
+    model.updates = file.get<uint64_t>("progress.updates", {})[0];
+    model.interactions = file.get<uint64_t>("progress.interactions", {})[0];
+    model.evaluations = file.get<uint64_t>("progress.evaluations", {})[0];
+}
+
+// Reads what save_model() wrote, or a checkpoint. Errors: model.names, model.value, import.metadata, safetensors.*.
 inline void load_model(ModelContents& model, const TensorFile& file) {
+    if (file.text("format") == checkpoint_format) return load_unfinished(model, file);
     const uint64_t state_dim = static_cast<uint64_t>(model.config.state_dim);
     load_parameters(model, file, {"log_temperature", "state_mean", "state_std"});
     file.read_into(std::span(model.log_temperature.value), "log_temperature", {});
@@ -125,15 +144,19 @@ inline void require_room(const TensorFile& file, const Settings& settings) {
             weights, " weights and more that its settings call for");
 }
 
-// Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
+// Returns the path of a model: `given` itself, or the model file of the run's folder `given`; of an unfinished run its
+// checkpoint.
 inline std::string model_path(const std::string& given) {
-    return std::filesystem::is_directory(given) ? given + "/model.safetensors" : given;
+    if (!std::filesystem::is_directory(given)) return given;
+    const std::string model = given + "/model.safetensors", checkpoint = given + "/checkpoint.safetensors";
+    return std::filesystem::exists(model) || !std::filesystem::exists(checkpoint) ? model : checkpoint;
 }
 
 // Errors: model.format, model.settings, safetensors.*, file.*.
 inline TensorFile open_model(const std::string& given) {
     TensorFile file = read_safetensors(model_path(given));
-    require(file.metadata.contains("format") && file.text("format") == model_format, "model.format", file.path,
+    const std::string format = file.metadata.contains("format") ? file.text("format") : "";
+    require(format == model_format || format == checkpoint_format, "model.format", file.path,
             " is a safetensors file, but no model that `wodtem train` has written");
     require_room(file, settings_in(file));
     return file;

@@ -19,8 +19,7 @@
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
 #include "console.hpp"
-#include "safetensors.hpp"  // and with it the standard headers
-#include "settings.hpp"
+#include "model_file.hpp"  // and with it safetensors.hpp, settings.hpp and the standard headers
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Rows of the logs.
@@ -154,23 +153,32 @@ inline void print_end(const std::string& path, const ProgressRow& row, const Set
                 score_text(settings, row.eval_return).c_str());
 }
 
-// The command `eval`: means over the episodes without an error, and on the grid world the first episode's moves.
+// The command `eval`: each episode, on the grid world with its moves; then the means over those without an error, and
+// the standard deviation of the returns over them.
 inline void print_evaluation(const Settings& settings, const std::vector<Episode>& episodes, double mean_length,
                              double mean_return) {
     size_t count = 0;
+    double squares = 0;
     for (const Episode& episode : episodes) {
-        count += episode.error.empty();
-        if (!episode.error.empty()) std::fprintf(stderr, "wodtem: an episode is dropped: %s\n", episode.error.c_str());
+        if (!episode.error.empty()) {
+            std::fprintf(stderr, "wodtem: an episode is dropped: %s\n", episode.error.c_str());
+            continue;
+        }
+        count += 1;
+        const double total = total_return(episode.trajectory);
+        squares += (total - mean_return) * (total - mean_return);
+        std::printf("episode %zu: length %d, return %s", count, episode.trajectory.length(),
+                    number_text(static_cast<float>(total)).c_str());
+        for (const float move : episode.trajectory.actions)
+            if (settings.task == "gridworld") std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
+        std::printf("\n");
     }
-    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s over %zu episode%s (%s)\n", settings.task.c_str(),
-                settings.method.c_str(), static_cast<long long>(settings.seed), number_text(mean_length).c_str(),
-                number_text(mean_return).c_str(), score_text(settings, mean_return).c_str(), count,
-                count == 1 ? "" : "s", physics_text(settings).c_str());
-    if (settings.task != "gridworld") return;
-    std::printf("first episode:");
-    for (const float move : episodes[0].trajectory.actions)
-        std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
-    std::printf("\n");
+    const float deviation = count > 1 ? static_cast<float>(std::sqrt(squares / static_cast<double>(count - 1))) : 0;
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s +- %s%s over %zu episode%s (%s)\n",
+                settings.task.c_str(), settings.method.c_str(), static_cast<long long>(settings.seed),
+                number_text(mean_length).c_str(), number_text(mean_return).c_str(), number_text(deviation).c_str(),
+                score_text(settings, mean_return).c_str(), count, count == 1 ? "" : "s",
+                physics_text(settings).c_str());
 }
 
 // The numbers that end a line of progress on the console.
@@ -284,8 +292,6 @@ inline void claim_folder(const RunFolder& folder, const Settings& settings) {
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The checkpoint. visit(archive) calls archive(name, field) for everything that is state.
-
-inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";
 
 // The logs reach the disk first: the checkpoint notes how long they are.
 inline void save_checkpoint(RunFolder& folder, const Settings& settings, auto&& visit) {

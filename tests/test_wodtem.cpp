@@ -1033,6 +1033,27 @@ TEST(evaluation_needs_the_model_file_alone) {
     CHECK_EQUAL(number_text(evaluation.mean_return), progress.rows.back()[13]);
 }
 
+// `eval` repeats the run's last evaluation, of a finished run and of an unfinished one; another seed has other starts.
+TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
+    const Scratch scratch;
+    const std::string run = scratch / "run", eval = "./wodtem eval " + run;
+    const auto last_row = [&] { return results::Log(run + "/progress.csv").table.rows.back(); };
+    const auto says = [&](const std::vector<std::string>& row) {
+        return "mean length " + row[12] + ", mean return " + row[13] + " +- 0 over 1 episode (grid world)";
+    };
+    train_until(tiny_settings("wodtem"), run, 2000);  // in the middle of the online phase
+    CHECK(fs::exists(run + "/checkpoint.safetensors") && !fs::exists(run + "/model.safetensors"));
+    check_shell(eval, 0, "gridworld, wodtem, seed 0: mean length");  // of the present network
+    quiet_train(tiny_settings("wodtem"), run);
+    check_shell(eval, 0, says(last_row()));
+    check_shell(eval, 0, "episode 1: length " + last_row()[12] + ", return " + last_row()[13] + " ");
+    check_shell(eval + " --seed 5 --episodes 3 --set g_eval=0.5 --set eval_context=1", 0, "seed 5: mean length");
+    check_shell(eval + " --episodes 3", 0, "over 3 episodes");
+    check_shell(eval + " --set alpha=0.5", 2, "eval takes --set g_eval=X and --set eval_context=N");
+    check_shell(eval + " --set g_eval=x", 2, "g_eval cannot be");
+    check_shell(eval + " --seed -1", 2, "nearest is 0");
+}
+
 // WODTEM sec. IV-B.3, step 4 test; WODTEM sec. IV-B.3, step 5 test
 TEST(progress_rows_keep_to_the_schedule) {
     const Scratch scratch;
@@ -1312,7 +1333,8 @@ TEST(damaged_models_are_refused) {
     f.save(scratch / "nan.safetensors");
     CHECK_FAILS("model.value", f.load(scratch / "nan.safetensors"));
     f.save_checkpoint(scratch.path);
-    CHECK_FAILS("model.format", open_model(scratch / "checkpoint.safetensors"));
+    CHECK_FAILS("model.value", f.load(scratch / "checkpoint.safetensors"));
+    CHECK_FAILS("model.format", open_model("tests/vectors/rng.safetensors"));
     CHECK_FAILS("file.open", open_model(scratch / "none.safetensors"));
 }
 
@@ -1511,7 +1533,9 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     stop_requested = 0;
     settings.dataset = " my set # 2\n.hdf5";  // another name for the same data: the same run
     quiet_train(settings, scratch / "renamed", 2);
-    check_shell("./wodtem eval " + scratch / "renamed", 0, "over 1 episode");
+    const std::vector<std::string> last = results::Log(scratch / "renamed/progress.csv").table.rows.back();
+    check_shell("./wodtem eval " + scratch / "renamed", 0,
+                "mean length " + last[12] + ", mean return " + last[13] + " +-");
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
 
@@ -1624,7 +1648,7 @@ std::string golden_header(const std::vector<MadeTensor>& tensors, bool checksums
         settings += c == '\n' ? "\\u000a" : c == '"' ? "\\\"" : std::string(1, c);
     return std::string("{\"__metadata__\":{") +
            (checksums ? "\"crc32.header\":\"00000000\",\"crc32.tensors\":\"" + sums + "\"," : "") +
-           "\"format\":\"wodtem model 1\",\"interactions\":\"345\",\"settings\":\"" + settings +
+           "\"evaluations\":\"67\",\"format\":\"wodtem model 1\",\"interactions\":\"345\",\"settings\":\"" + settings +
            "\",\"updates\":\"12\"}" + list + "}";
 }
 
@@ -1649,6 +1673,7 @@ TEST(a_model_made_by_rule_is_read_and_written_back_byte_for_byte) {
     ModelContents contents = contents_of(f.run.agent);
     load_model(contents, open_model(scratch / "golden.safetensors"));
     CHECK_EQUAL(contents.interactions, 345u);
+    CHECK_EQUAL(contents.evaluations, 67u);
     CHECK_EQUAL(f.run.agent.model.parameters[0].value[1], 0.5f + 37.0f / 128.0f);
     save_model(contents, scratch / "back.safetensors");
     CHECK(read_file(scratch / "back.safetensors") == golden);
