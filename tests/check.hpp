@@ -995,7 +995,7 @@ Table empty_table(Case& c) {
     const bool projects = c.has("in/projection");
     const Array<double> projection =
         projects ? c.in<double>("projection", {any, states.shape[1]}) : Array<double>{{0, 0}, {}};
-    check_finite("projection", projection.values.data(), projection.values.size());
+    check_column("projection", projection.values, projection.shape[0], projection.shape[1]);
     EpisodicMemory memory(memory_settings(c, states.extent(1), actions.extent(1), projection.extent(0), n), 0);
     memory.projection = projection.values;
     return {states, actions, e, std::move(memory)};
