@@ -28,8 +28,7 @@ struct CollectedRows {
 
     // Calls f(name, array, is_table) for each array in the order of D4RL's files: its name there, a pointer to the
     // member, and whether it has two dimensions.
-    template <class F>
-    static void each_array(F&& f) {
+    static void each_array(auto&& f) {
         f("observations", &CollectedRows::observations, true);
         f("next_observations", &CollectedRows::next_observations, true);
         f("actions", &CollectedRows::actions, true);
