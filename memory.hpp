@@ -261,20 +261,16 @@ struct ReplayBuffer {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
         if (draw == Draw::by_length) return window_at(random.below(ends.back(), update, window_index), context_length);
         const size_t drawn = random.below(trajectories.size(), update, window_index);
-        const uint64_t start = random.below(trajectories[drawn].rewards.size(), update, window_index, 1);
-        return window_of(drawn, static_cast<int>(start), context_length);
+        const uint64_t length = trajectories[drawn].rewards.size(), first = ends[drawn] - length;
+        return window_at(first + random.below(length, update, window_index, 1), context_length);
     }
 
     // The window that starts at a step, 0 <= step < ends.back(), of all trajectories laid end to end.
     Window window_at(uint64_t step, int context_length) const {
         const auto end = std::upper_bound(ends.begin(), ends.end(), step);  // the first trajectory to end after `step`
         const auto trajectory = static_cast<size_t>(end - ends.begin());
-        return window_of(trajectory, trajectories[trajectory].length() - static_cast<int>(*end - step), context_length);
-    }
-
-    // The window that starts at a step of the trajectory in a place of the buffer.
-    Window window_of(size_t trajectory, int start, int context_length) const {
-        return {trajectory, start, std::min(context_length, trajectories[trajectory].length() - start)};
+        const int left = static_cast<int>(*end - step);
+        return {trajectory, trajectories[trajectory].length() - left, std::min(context_length, left)};
     }
 };
 

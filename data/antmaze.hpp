@@ -168,8 +168,8 @@ inline CollectedRows<float> collect_ant_maze_set(const MujocoTask& task, size_t 
     MujocoEnvironment environment(task, Physics::d4rl);
     Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
-    std::vector<float> state(29), seen(walking_ant_state), action(8);
-    const std::vector<float> mean_action(8);  // the walker's noise is 0
+    std::vector<float> state(29), seen(walking_ant_state);
+    const std::vector<float> no_noise(8);  // of the walker's own
     const MazeGrid grid{task.maze};
     CollectedRows<float> set;
     for (uint64_t episode = data_set_episodes; set.length() < steps; ++episode) {
@@ -192,7 +192,7 @@ inline CollectedRows<float> collect_ant_maze_set(const MujocoTask& task, size_t 
             append_all(rows.observations, o);
             const auto scatter = [&](uint32_t i) { return random.uniform(episode, t, AntDraw::waypoint + i); };
             see_from(heading_to_goal(plan, {o[0], o[1]}, goal, {scatter(0), scatter(1)}), o, seen.data());
-            sac::act(tape, walker, seen.data(), mean_action.data(), action.data());
+            std::vector<float> action = sac::act(tape, walker, seen.data(), no_noise).first;
             for (uint32_t i = 0; i < 8; ++i) {
                 const float noise = static_cast<float>(ant_noise) * random.normal(episode, t, AntDraw::noise + i);
                 action[i] = std::clamp(action[i] + noise, -1.0f, 1.0f);

@@ -186,11 +186,9 @@ struct Sample {
 // which rlkit clamps to [-20, 2]. noise [n, A]: standard normal. The gradient goes through the actions alone.
 template <class T>
 Sample<T> draw(Tape<T>& tape, Tensor<T> states, Tensor<T> output, const float* noise) {
-    const ptrdiff_t S = states.columns, A = output.columns / 2, width = S + A;
-    const Tensor<T> pairs = tape.make(output.rows, states.columns + output.columns / 2);
-    const Tensor<T> log_prob = tape.make(output.rows, 1),
-                    normal = tape.constant(noise, output.rows, output.columns / 2);
-    for (ptrdiff_t row = 0; row < output.rows; ++row) {
+    const int n = output.rows, S = states.columns, A = output.columns / 2, width = S + A;
+    const Tensor<T> pairs = tape.make(n, width), log_prob = tape.make(n, 1), normal = tape.constant(noise, n, A);
+    for (ptrdiff_t row = 0; row < n; ++row) {
         const T *mean = output.value + row * 2 * A, *l = mean + A, *z = normal.value + row * A;
         T* const action = std::copy_n(states.value + row * S, S, pairs.value + row * width);
         log_prob.value[row] = 0;
@@ -203,7 +201,7 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> states, Tensor<T> output, const float* n
     tape.on_backward({}, [=] {  // there are two results, so the step is never skipped
         const T *d_pairs = gradient_of(pairs), *d_log_prob_of = gradient_of(log_prob);
         T* const d_output = gradient_of(output);
-        for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
+        for (ptrdiff_t i = 0; i < ptrdiff_t{n} * A; ++i) {
             const ptrdiff_t action = i / A * width + S + i % A, mean = i / A * 2 * A + i % A, l = mean + A;
             const T a = pairs.value[action], d_log_prob = d_log_prob_of[i / A], log_std = output.value[l];
             const T du = (T(1) - a * a) * d_pairs[action] + T(2) * a * d_log_prob;
@@ -288,32 +286,34 @@ EACH_TARGET inline void soft_update(std::vector<float>& target, const std::vecto
 // ---------------------------------------------------------------------------------------------------------------------
 // Acting.
 
-// Writes the policy's action [A] at a state [S] and returns its log-probability (D4RL's infos/action_log_probs).
-// noise [A]: standard normal, or zeros for the mean action. The tape is emptied and stops recording.
-inline float act(Tape<float>& tape, Network<float>& policy, const float* state, const float* noise, float* action) {
+using ActionAndLogProb = std::pair<std::vector<float>, float>;  // [A]; D4RL's infos/action_log_probs
+
+// The policy's action at a state [S]. noise [A]: standard normal, or zeros for the mean action. The tape is emptied and
+// stops recording.
+inline ActionAndLogProb act(Tape<float>& tape, Network<float>& policy, const float* state,
+                            const std::vector<float>& noise) {
     tape.reset();
     tape.recording = false;
     const Tensor<float> states = tape.constant(state, 1, policy.inputs());
-    const Sample<float> sample = draw(tape, states, forward(tape, policy, states), noise);
-    std::copy_n(sample.pairs.value + policy.inputs(), policy.outputs() / 2, action);
-    return sample.log_prob.value[0];
+    const Sample<float> sample = draw(tape, states, forward(tape, policy, states), noise.data());
+    const float* values = sample.pairs.value + policy.inputs();
+    return {{values, values + noise.size()}, sample.log_prob.value[0]};
 }
 
 // The same with the noise of a time-step of an episode.
-inline float act_sampled(Tape<float>& tape, Network<float>& policy, const float* state, uint32_t seed, uint64_t episode,
-                         uint32_t t, float* action) {
+inline ActionAndLogProb act_sampled(Tape<float>& tape, Network<float>& policy, const float* state, uint32_t seed,
+                                    uint64_t episode, uint32_t t) {
     std::vector<float> noise(policy.outputs() / 2);
     for (uint32_t i = 0; i < noise.size(); ++i) noise[i] = Random{seed, Stream::exploration}.normal(episode, t, i);
-    return act(tape, policy, state, noise.data(), action);
+    return act(tape, policy, state, noise);
 }
 
 // Plays an episode with sampled actions, and appends their log-probabilities to `log_probs` if it is given.
 inline Episode play_sampled(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed,
                             uint64_t number, std::vector<float>* log_probs = nullptr) {
     return play(environment, {seed, Stream::environment}, number, [&](const Episode& episode) {
-        std::vector<float> action(policy.outputs() / 2);
-        const float log_prob =
-            act_sampled(tape, policy, episode.state.data(), seed, number, episode.trajectory.length(), action.data());
+        const int t = episode.trajectory.length();
+        const auto [action, log_prob] = act_sampled(tape, policy, episode.state.data(), seed, number, t);
         if (log_probs) log_probs->push_back(log_prob);
         return action;
     });
@@ -381,7 +381,7 @@ struct Learner {
         const uint32_t t = static_cast<uint32_t>(p.episode_steps);
         std::vector<float> action(spec.action_dim), next_state(state.size());
         if (p.steps >= settings.random_steps)
-            act_sampled(acting, policy, state.data(), settings.seed, p.episodes, t, action.data());
+            action = act_sampled(acting, policy, state.data(), settings.seed, p.episodes, t).first;
         else
             for (uint32_t i = 0; i < action.size(); ++i)
                 action[i] = static_cast<float>(2 * random.uniform(p.episodes, t, i) - 1);

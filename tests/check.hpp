@@ -1423,9 +1423,9 @@ void check_sampling(Case& c) {
                         draws.values[2 * i + 1] >= buffer.trajectories[draws.values[2 * i]].length()))
             fail("check.value", "%s: case %s: draw %zu names no step of the buffer", c.file.path.c_str(),
                  c.name.c_str(), i);
-        const Window window =
-            uniform ? buffer.window_of(draws.values[2 * i], static_cast<int>(draws.values[2 * i + 1]), context_length)
-                    : buffer.window_at(static_cast<uint64_t>(draws.values[i]), context_length);
+        uint64_t step = static_cast<uint64_t>(draws.values[uniform ? 2 * i + 1 : i]);
+        if (uniform && draws.values[2 * i] > 0) step += buffer.ends[draws.values[2 * i] - 1];
+        const Window window = buffer.window_at(step, context_length);
         trajectory.push_back(static_cast<int>(window.trajectory));
         start.push_back(window.start);
         length.push_back(window.length);

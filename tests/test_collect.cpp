@@ -502,12 +502,11 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     whole.parameters = network.parameters;
     whole.parameters[0] = {"fc0.weight", {256, 111}, weights, std::vector<float>(weights.size())};
     Tape<float> tape(one_thread());
-    std::vector<float> action(8);
     Random normals{test_seed(), Stream::exploration};
     for (uint32_t t = 0; t < 20; ++t) {
         std::vector<float> noise(8);
         for (uint32_t i = 0; i < 8; ++i) noise[i] = normals.normal(data_set_episodes, t, i);
-        const float log_prob = sac::act(tape, whole, rows.observation(t), noise.data(), action.data());
+        const auto [action, log_prob] = sac::act(tape, whole, rows.observation(t), noise);
         CHECK_CLOSE(log_prob, log_probs[t], 1e-4);
         for (size_t i = 0; i < 8; ++i) CHECK_CLOSE(action[i], rows.actions[8 * t + i], 1e-5);
     }

@@ -367,10 +367,8 @@ struct Bandit : Environment {
 // An episode with the policy's mean actions.
 Episode play_mean(sac::Learner& learner, Environment& environment, uint64_t number) {
     return play(environment, {test_seed(), Stream::environment}, number, [&](const Episode& episode) {
-        const std::vector<float> noise(learner.spec.action_dim);
-        std::vector<float> action(noise.size());
-        sac::act(learner.acting, learner.policy, episode.state.data(), noise.data(), action.data());
-        return action;
+        const std::vector<float> no_noise(learner.spec.action_dim);
+        return sac::act(learner.acting, learner.policy, episode.state.data(), no_noise).first;
     });
 }
 
@@ -434,10 +432,8 @@ TEST(sac_values_of_a_bandit_are_its_rewards_and_its_best_action_is_found) {
     sac::Learner learner(small_settings(), environment.spec(), one_thread());
     for (int i = 0; i < 2000; ++i) learner.step(environment);
     CHECK_EQUAL(learner.progress.episodes, uint64_t{2000});
-    const float state = 1, zero = 0;
-    float action;
-    sac::act(learner.acting, learner.policy, &state, &zero, &action);
-    CHECK_CLOSE(action, 0.6, 0.1);
+    const float state = 1;
+    CHECK_CLOSE(sac::act(learner.acting, learner.policy, &state, {0}).first[0], 0.6, 0.1);
     for (const double a : {0.2, 0.6, 0.9})
         for (const sac::Network<float>& critic : learner.critics)
             CHECK_CLOSE(plain_forward(critic, {1, a})[0], 1 - (a - 0.6) * (a - 0.6), 0.05);
@@ -667,8 +663,7 @@ TEST(sac_policy_file_keeps_every_bit_and_has_the_names_and_shapes_of_d4rl) {
     const auto state = draws.normals(11), noise = draws.normals(3);
     const std::vector<double> output = plain_forward(network, {state.begin(), state.end()});
     Tape<float> tape(one_thread());
-    float action[3];
-    const float log_prob = sac::act(tape, loaded, state.data(), noise.data(), action);
+    const auto [action, log_prob] = sac::act(tape, loaded, state.data(), noise);
     double expected = 0;
     for (size_t j = 0; j < 3; ++j) {
         const double z = static_cast<double>(noise[j]), a = std::tanh(output[j] + std::exp(output[3 + j]) * z);
