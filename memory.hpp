@@ -348,11 +348,10 @@ struct KdTree {
             }
             widest = std::max(widest, {most - least, d});
         }
-        const auto x = [&](uint32_t entry) { return points.at(entry, widest.second); };
+        const uint32_t dim = widest.second, pair = take_pair(points.dim);
         const auto half = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
-        std::ranges::nth_element(order, half, {}, [&](uint32_t entry) { return std::pair(x(entry), entry); });
-        const uint32_t pair = take_pair(points.dim);
-        nodes[node] = {2 * pair, widest.second, x(*half), nodes[node].count};
+        std::ranges::nth_element(order, half, {}, [&](uint32_t i) { return std::pair(points.at(i, dim), i); });
+        nodes[node] = {2 * pair, dim, points.at(*half, dim), nodes[node].count};
         numbers[node] = *half;
         build_node(points, 2 * pair, place, {order.begin(), half});
         build_node(points, 2 * pair + 1, pair, {half, order.end()});

@@ -17,8 +17,9 @@ struct MazeGrid {
     std::string_view map;
     int columns = static_cast<int>(map.find('/')), rows = static_cast<int>(map.size()) / (columns + 1);
 
-    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
+    // Whether a place is on the map; NaN is not.
     bool contains(double row, double column) const { return row >= 0 && row < rows && column >= 0 && column < columns; }
+    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
     bool can_enter(MazeCell to) const {
         return contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
     }
@@ -60,9 +61,11 @@ struct MazePlan {
     }
 
     // The cell after each move of maze2d's plan, up to the target; of the moves that come nearer the first in the order
-    // left, right, up, down. D4RL follows the values Q that 50 sweeps of value iteration leave, which is the same: the
-    // tests hold this to them. At least one move is made, so from the target itself the path is the target. If no way
+    // left, right, up, down. At least one move is made, so from the target itself the path is the target. If no way
     // leads to the target, it is 100 times the start.
+    // D4RL goes to the largest of exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0, with R = 1
+    // in the target and 0 elsewhere; of equals to the first, in this order behind staying. Cells of equal distance have
+    // equal values and nearer ones greater, up to 49 moves; so the path is the same. The tests hold it to those sweeps.
     std::vector<MazeCell> path(MazeCell at) const {
         std::vector<MazeCell> cells;
         do {
