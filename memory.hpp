@@ -213,8 +213,8 @@ struct Window {
 };
 
 // How a trajectory is drawn from the buffer: with probability proportional to its length, as DT's and ODT's code, or
-// each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps counts
-// 1 / T, so that short episodes weigh more.
+// each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps
+// counts 1 / T, so that short episodes weigh more.
 enum class Draw { by_length, uniform };
 
 struct ReplayBuffer {
@@ -235,7 +235,7 @@ struct ReplayBuffer {
         count_steps();
     }
 
-    // WODTEM sec. III-A, D_online: first in, first out: append until full, then overwrite from 0 upwards, lap after lap.
+    // WODTEM sec. III-A, D_online: first in, first out: append until full, then overwrite from 0 up, lap after lap.
     void add(Trajectory trajectory) {
         if (trajectories.size() < capacity) {
             trajectories.push_back(std::move(trajectory));

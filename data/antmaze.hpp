@@ -18,8 +18,8 @@
 #include "waypoints.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The planner. D4RL counts a position to the column 1 + floor(x / 4), so a cell begins at its own centre: an ant that has
-// reached a way-point turns to the next one.
+// The planner. D4RL counts a position to the column 1 + floor(x / 4), so a cell begins at its own centre: an ant that
+// has reached a way-point turns to the next one.
 
 constexpr double ant_cell = 4;  // m
 
@@ -43,8 +43,8 @@ constexpr int walking_ant_state = 27;
 // Writes what the walker sees, [27]: the observation without x and y, in a frame whose x axis is the commanded
 // direction, `heading`, rad, from the world's x axis.
 // departs from D4RL's walker: that one is given the 27 numbers and the direction as two more.
-// The floor looks the same from all sides, so what was learned for one direction holds for all. Of the quaternions q and
-// -q, which are one rotation, the walker sees the one with w >= 0.
+// The floor looks the same from all sides, so what was learned for one direction holds for all. Of the quaternions q
+// and -q, which are one rotation, the walker sees the one with w >= 0.
 inline void see_from(double heading, std::span<const double> observation, float* seen) {
     const double c = std::cos(heading), s = std::sin(heading);
     const double turn_w = std::cos(heading / 2), turn_z = -std::sin(heading / 2);  // a rotation by -heading about z

@@ -39,7 +39,7 @@ struct MazePlan {
     std::vector<int> distance;   // [cell] moves to the target, or no_way
     std::vector<MazeCell> next;  // [cell] where the first move leads; the target's is itself; {-1, -1}: no way
 
-    // Of the ways that are equally short `next` takes the one found first, neighbours in the order left, right, down, up.
+    // Of the ways that are equally short `next` takes the first found, neighbours in the order left, right, down, up.
     MazePlan(const MazeGrid& maze, MazeCell target)
         : grid(maze),
           distance(maze.rows * maze.columns, no_way),
@@ -63,9 +63,9 @@ struct MazePlan {
     // The cell after each move of maze2d's plan, up to the target; of the moves that come nearer the first in the order
     // left, right, up, down. At least one move is made, so from the target itself the path is the target. If no way
     // leads to the target, it is 100 times the start.
-    // D4RL goes to the largest of exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0, with R = 1
-    // in the target and 0 elsewhere; of equals to the first, in this order behind staying. Cells of equal distance have
-    // equal values and nearer ones greater, up to 49 moves; so the path is the same. The tests hold it to those sweeps.
+    // D4RL follows the largest Q after exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0,
+    // with R = 1 in the target and 0 elsewhere; of equals the first, in this order behind staying. Cells of equal distance
+    // have equal values and nearer ones greater, up to 49 moves: the same path. The tests hold it to those sweeps.
     std::vector<MazeCell> path(MazeCell at) const {
         std::vector<MazeCell> cells;
         do {

@@ -1,5 +1,6 @@
-// test_waypoints.cpp: the planner against breadth-first search and D4RL's value iteration, that against a closed form, the controller against numbers worked
-// out by hand, the data set against its definition, mechanics, and what is published of D4RL's.
+// test_waypoints.cpp: the planner against breadth-first search and D4RL's value iteration, that against a closed form,
+// the controller against numbers worked out by hand, the data set against its definition, mechanics, and what is
+// published of D4RL's.
 #include <deque>
 #include <map>
 
