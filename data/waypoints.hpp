@@ -64,8 +64,8 @@ struct MazePlan {
     // left, right, up, down. At least one move is made, so from the target itself the path is the target. If no way
     // leads to the target, it is 100 times the start.
     // D4RL follows the largest Q after exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0,
-    // with R = 1 in the target and 0 elsewhere; of equals the first, in this order behind staying. Cells of equal distance
-    // have equal values and nearer ones greater, up to 49 moves: the same path. The tests hold it to those sweeps.
+    // with R = 1 in the target and 0 elsewhere; of equals the first, in this order behind staying. Cells of equal
+    // distance have equal values and nearer ones greater, up to 49 moves: the same path. The tests compare the two.
     std::vector<MazeCell> path(MazeCell at) const {
         std::vector<MazeCell> cells;
         do {

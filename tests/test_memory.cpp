@@ -627,7 +627,7 @@ TEST(the_tree_survives_any_order_of_coming_and_going) {
 }
 
 TEST(many_equal_points_neither_break_nor_slow_the_tree) {
-    // 50,000 states that differ only in a coordinate that the projection does not see; 50,000 more evict all but 10,000.
+    // 50,000 states that differ only in a coordinate the projection does not see; 50,000 more evict all but 10,000.
     EpisodicMemory memory(
         {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 60000, .K = 2, .epsilon = 1}, 1);
     memory.projection = {1, 0, 0, 0, 1, 0};
