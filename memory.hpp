@@ -58,21 +58,14 @@ inline std::vector<double> discounted_returns(const std::vector<float>& rewards,
 // departs from ODT's code: summed in double, not in float32, so that the order of additions hardly matters.
 inline std::vector<double> returns_to_go(const std::vector<float>& rewards) { return discounted_returns(rewards, 1.0); }
 
-template <class Number>
-void check_finite(const char* what, const Number* values, size_t count) {
-    for (size_t i = 0; i < count; ++i)
-        if (!std::isfinite(values[i]))
-            fail("memory.not_finite", "%s[%zu] is %g; only finite numbers can be remembered", what, i,
-                 static_cast<double>(values[i]));
-}
-
-// Refuses a column of a trajectory of `steps` steps that has not `width` finite numbers a step. Errors: memory.shape,
-// memory.not_finite.
-template <class Number>
-void check_column(const char* what, const std::vector<Number>& column, size_t steps, size_t width) {
+// Refuses a column without `width` finite numbers for each of `steps` steps. Errors: memory.shape, memory.not_finite.
+void check_column(const char* what, const auto& column, size_t steps, size_t width) {
     if (column.size() != steps * width)
         fail("memory.shape", "%zu %s for %zu steps, expected %zu", column.size(), what, steps, steps * width);
-    check_finite(what, column.data(), column.size());
+    for (size_t i = 0; i < column.size(); ++i)
+        if (!std::isfinite(column[i]))
+            fail("memory.not_finite", "%s[%zu] is %g; only finite numbers can be remembered", what, i,
+                 double{column[i]});
 }
 
 // Validates a trajectory and computes both returns from its rewards; targets used while acting play no part.
@@ -89,8 +82,7 @@ inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, doubl
 
 // WODTEM sec. III-A: the total return is g_1.
 inline double total_return(const Trajectory& trajectory) {
-    if (trajectory.returns_to_go.empty())
-        fail("memory.not_relabelled", "a trajectory has no returns: relabel it first");
+    if (trajectory.returns_to_go.empty()) fail("memory.not_relabelled", "a trajectory has no returns: relabel it");
     return trajectory.returns_to_go.front();
 }
 
@@ -180,9 +172,8 @@ struct Environments {
 
 // Plays one episode in each environment, numbered from `first` on, in lockstep up to termination or the time limit.
 // choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over.
-template <class Choose>
 std::vector<Episode> play(std::span<Environment* const> environments, const Random& resets, uint64_t first,
-                          Choose&& choose, Threads* threads) {
+                          auto&& choose, Threads* threads) {
     const EnvironmentSpec spec = environments[0]->spec();
     std::vector<Episode> episodes(environments.size());
     std::vector<Episode*> running;
@@ -206,8 +197,7 @@ std::vector<Episode> play(std::span<Environment* const> environments, const Rand
 }
 
 // The same for one environment: choose(episode) returns one action [action_dim].
-template <class Choose>
-Episode play(Environment& environment, const Random& resets, uint64_t number, Choose&& choose) {
+Episode play(Environment& environment, const Random& resets, uint64_t number, auto&& choose) {
     Environment* const environments[] = {&environment};
     Threads alone(1);
     return std::move(play(
@@ -223,8 +213,8 @@ struct Window {
 };
 
 // How a trajectory is drawn from the buffer: with probability proportional to its length, as DT's and ODT's code, or
-// each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps counts
-// 1 / T, so that short episodes weigh more.
+// each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps
+// counts 1 / T, so that short episodes weigh more.
 enum class Draw { by_length, uniform };
 
 struct ReplayBuffer {
@@ -245,8 +235,7 @@ struct ReplayBuffer {
         count_steps();
     }
 
-    // WODTEM sec. III-A, D_online: first in, first out: append until full, then overwrite from index 0 upwards, lap
-    // after lap.
+    // WODTEM sec. III-A, D_online: first in, first out: append until full, then overwrite from 0 up, lap after lap.
     void add(Trajectory trajectory) {
         if (trajectories.size() < capacity) {
             trajectories.push_back(std::move(trajectory));
@@ -259,13 +248,12 @@ struct ReplayBuffer {
 
     void count_steps() {
         ends.clear();
-        for (const Trajectory& trajectory : trajectories)
-            ends.push_back((ends.empty() ? 0 : ends.back()) + static_cast<uint64_t>(trajectory.length()));
+        uint64_t steps = 0;
+        for (const Trajectory& trajectory : trajectories) ends.push_back(steps += trajectory.rewards.size());
     }
 
     // WODTEM sec. III-B, C^t: the steps of a sub-trajectory. A trajectory is drawn, and a start uniformly from its
-    // steps; the window is the next min(context_length, steps left) steps. So windows that start near the end of a
-    // trajectory are short.
+    // steps; the window is the next min(context_length, steps left) steps, so those near the end are short.
     // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
     // by_length: one number drawn from all steps laid end to end has exactly these probabilities, for each step is one
     // start. uniform: a second number, of site 1, draws the start.
@@ -273,20 +261,16 @@ struct ReplayBuffer {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
         if (draw == Draw::by_length) return window_at(random.below(ends.back(), update, window_index), context_length);
         const size_t drawn = random.below(trajectories.size(), update, window_index);
-        const uint64_t length = static_cast<uint64_t>(trajectories[drawn].length());
-        return window_of(drawn, static_cast<int>(random.below(length, update, window_index, 1)), context_length);
+        const uint64_t length = trajectories[drawn].rewards.size(), first = ends[drawn] - length;
+        return window_at(first + random.below(length, update, window_index, 1), context_length);
     }
 
     // The window that starts at a step, 0 <= step < ends.back(), of all trajectories laid end to end.
     Window window_at(uint64_t step, int context_length) const {
         const auto end = std::upper_bound(ends.begin(), ends.end(), step);  // the first trajectory to end after `step`
         const auto trajectory = static_cast<size_t>(end - ends.begin());
-        return window_of(trajectory, trajectories[trajectory].length() - static_cast<int>(*end - step), context_length);
-    }
-
-    // The window that starts at a step of the trajectory in a place of the buffer.
-    Window window_of(size_t trajectory, int start, int context_length) const {
-        return {trajectory, start, std::min(context_length, trajectories[trajectory].length() - start)};
+        const int left = static_cast<int>(*end - step);
+        return {trajectory, trajectories[trajectory].length() - left, std::min(context_length, left)};
     }
 };
 
@@ -316,6 +300,7 @@ struct Points {
     const uint64_t* ages;  // [entry]
     size_t dim;
 
+    float at(size_t entry, size_t d) const { return rows[entry * dim + d]; }
     // The order of neighbours. Ties: smaller distance, then older entry.
     bool closer(const Neighbour& a, const Neighbour& b) const {
         return a.distance < b.distance || (a.distance == b.distance && ages[a.entry] < ages[b.entry]);
@@ -358,16 +343,15 @@ struct KdTree {
         for (uint32_t d = 0; d < points.dim; ++d) {
             float least = INFINITY, most = -INFINITY;
             for (const uint32_t entry : order) {
-                least = std::min(least, points.rows[entry * points.dim + d]);
-                most = std::max(most, points.rows[entry * points.dim + d]);
+                least = std::min(least, points.at(entry, d));
+                most = std::max(most, points.at(entry, d));
             }
             widest = std::max(widest, {most - least, d});
         }
-        const auto x = [&](uint32_t entry) { return points.rows[entry * points.dim + widest.second]; };
+        const uint32_t dim = widest.second, pair = take_pair(points.dim);
         const auto half = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
-        std::ranges::nth_element(order, half, {}, [&](uint32_t entry) { return std::pair(x(entry), entry); });
-        const uint32_t pair = take_pair(points.dim);
-        nodes[node] = {2 * pair, widest.second, x(*half), nodes[node].count};
+        std::ranges::nth_element(order, half, {}, [&](uint32_t i) { return std::pair(points.at(i, dim), i); });
+        nodes[node] = {2 * pair, dim, points.at(*half, dim), nodes[node].count};
         numbers[node] = *half;
         build_node(points, 2 * pair, place, {order.begin(), half});
         build_node(points, 2 * pair + 1, pair, {half, order.end()});
@@ -388,8 +372,7 @@ struct KdTree {
 
     void put(const Points& points, size_t place, size_t lane, uint32_t entry) {
         entries[place][lane] = entry;
-        for (size_t d = 0; d < points.dim; ++d)
-            coordinates[place * points.dim + d][lane] = points.rows[entry * points.dim + d];
+        for (size_t d = 0; d < points.dim; ++d) coordinates[place * points.dim + d][lane] = points.at(entry, d);
     }
 
     // The leaf of an entry, and the highest node above it that loses its balance when the counts of the nodes above the
@@ -398,7 +381,7 @@ struct KdTree {
         uint32_t at = 0, highest = no_entry;
         while (nodes[at].dim != leaf) {
             const uint32_t count = nodes[at].count += change;
-            const float x = points.rows[entry * points.dim + nodes[at].dim];
+            const float x = points.at(entry, nodes[at].dim);
             const bool high = x == nodes[at].split ? entry >= numbers[at] : x > nodes[at].split;
             const uint32_t next = nodes[at].child + high;
             const uint32_t heavier = std::max(nodes[next].count + change, nodes[next ^ 1].count);
@@ -536,8 +519,8 @@ struct EpisodicMemory {
     using HeapItem = std::tuple<uint64_t, uint64_t, uint32_t>;  // (priority, age, entry)
 
     MemoryConfig config;
-    size_t S, A;                     // state_dim, action_dim
-    size_t dim;                      // of the space that is searched: projected_dim, or state_dim without projection
+    size_t S = config.state_dim, A = config.action_dim;
+    size_t dim = config.projected_dim ? config.projected_dim : S;  // of the space that is searched
     std::vector<double> projection;  // [projected_dim, state_dim], entries N(0, 1 / projected_dim)
 
     // The table, one column per field; n = size() entries.
@@ -556,18 +539,13 @@ struct EpisodicMemory {
     KdTree tree;  // over `projected`
 
     // Errors: memory.config. Reserves the memory for all entries, so that no update copies a column.
-    EpisodicMemory(const MemoryConfig& settings, uint32_t seed)
-        : config(settings),
-          S(config.state_dim),
-          A(config.action_dim),
-          dim(config.projected_dim ? config.projected_dim : config.state_dim) {
-        if (config.state_dim < 1 || config.action_dim < 1 || config.projected_dim < 0 || config.K < 1 ||
-            config.capacity < 1 || config.capacity > 0x7FFFFFFF || !(config.epsilon >= 0.0) || !(config.tau > 0.0))
+    EpisodicMemory(const MemoryConfig& c, uint32_t seed) : config(c) {
+        if (c.state_dim < 1 || c.action_dim < 1 || c.K < 1 || c.projected_dim < 0 || c.capacity < 1 ||
+            c.capacity > 0x7FFFFFFF || !(c.epsilon >= 0.0) || !(c.tau > 0.0))
             fail("memory.config",
                  "episodic memory needs state_dim, action_dim, K, capacity >= 1, projected_dim, epsilon >= 0, tau > 0; "
                  "got %d, %d, %d, %zu, %d, %g, %g",
-                 config.state_dim, config.action_dim, config.K, config.capacity, config.projected_dim, config.epsilon,
-                 config.tau);
+                 c.state_dim, c.action_dim, c.K, c.capacity, c.projected_dim, c.epsilon, c.tau);
         // WODTEM sec. IV-B.1, projection: random, from R^F to R^F1. Variance 1 / F1 keeps the expected squared
         // distance, so that epsilon means the same before and after.
         const Random random{seed, Stream::projection};
@@ -692,7 +670,7 @@ struct EpisodicMemory {
 
     // [state_dim] -> [dim]. Accumulated in double, rounded once. Without projection: the state itself.
     void project(const float* state, float* point) const {
-        check_finite("state", state, S);
+        check_column("state", std::span(state, S), 1, S);
         constexpr double largest = std::numeric_limits<float>::max();
         if (projection.empty()) std::copy_n(state, S, point);
         for (size_t row = 0; row * S < projection.size(); ++row) {
@@ -791,8 +769,7 @@ struct EpisodicMemory {
     // ---- columns
 
     // Calls each(name, column, numbers per entry) for every column of the table.
-    template <class Self, class Each>
-    static void for_each_column(Self& self, const Each& each) {
+    static void for_each_column(auto& self, const auto& each) {
         each("memory.keys", self.keys, size_t{4});
         each("memory.projected", self.projected, self.dim);
         each("memory.actions", self.actions, self.A);

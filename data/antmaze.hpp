@@ -1,7 +1,7 @@
 // antmaze.hpp: how D4RL made its antmaze data: an ant that walks in a commanded direction, a planner on the maze's
 // cells that gives the command, and rewards that are written in afterwards.
 //
-//   planner      breadth-first from the goal's cell: for each cell the next one
+//   planner      MazePlan of waypoints.hpp: for each cell the next one
 //   walker       WalkingAnt is the task that sac.hpp trains a walker on; the trained one lies in data/policies
 //   data set     8 arrays of a row per step, those of D4RL's files
 //
@@ -18,8 +18,8 @@
 #include "waypoints.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The planner. Cells are the characters of the map; x runs along columns, and D4RL counts a position to the column
-// 1 + floor(x / 4), so a cell begins at its own centre: an ant that has reached a way-point turns to the next one.
+// The planner. D4RL counts a position to the column 1 + floor(x / 4), so a cell begins at its own centre: an ant that
+// has reached a way-point turns to the next one.
 
 constexpr double ant_cell = 4;  // m
 
@@ -30,34 +30,6 @@ inline MazeCell ant_cell_of(double x, double y) {
 inline MazePoint ant_cell_centre(MazeCell cell) {
     return {ant_cell * (cell.column - 1), ant_cell * (cell.row - 1)};  // x, y
 }
-
-struct AntPlan {
-    int rows = 0, columns = 0;
-    std::vector<MazeCell> next;  // [rows * columns] towards the goal; the goal's own is itself; {-1, -1}: no way
-
-    // Breadth-first from the goal, neighbours left, right, down, up. A cell in a wall gets a next cell too, but no path
-    // leads through it: the torso of an ant may be over the corner of a wall.
-    AntPlan(std::string_view map, MazeCell goal) {
-        columns = static_cast<int>(map.find('/'));
-        rows = static_cast<int>(map.size()) / (columns + 1);
-        next.assign(rows * columns, {-1, -1});
-        next[number(goal)] = goal;
-        std::vector<MazeCell> queue = {goal};
-        for (size_t i = 0; i < queue.size(); ++i) {
-            const MazeCell at = queue[i];
-            for (const MazeCell move : {MazeCell{0, -1}, {0, 1}, {1, 0}, {-1, 0}}) {
-                const MazeCell to = {at.row + move.row, at.column + move.column};
-                if (!contains(to) || next[number(to)].row >= 0) continue;
-                next[number(to)] = at;
-                if (map[to.row * (columns + 1) + to.column] != '1') queue.push_back(to);
-            }
-        }
-    }
-    bool contains(MazeCell cell) const {
-        return cell.row >= 0 && cell.row < rows && cell.column >= 0 && cell.column < columns;
-    }
-    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
-};
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The walker.
@@ -71,8 +43,8 @@ constexpr int walking_ant_state = 27;
 // Writes what the walker sees, [27]: the observation without x and y, in a frame whose x axis is the commanded
 // direction, `heading`, rad, from the world's x axis.
 // departs from D4RL's walker: that one is given the 27 numbers and the direction as two more.
-// The floor looks the same from all sides, so what was learned for one direction holds for all. Of the quaternions q and
-// -q, which are one rotation, the walker sees the one with w >= 0.
+// The floor looks the same from all sides, so what was learned for one direction holds for all. Of the quaternions q
+// and -q, which are one rotation, the walker sees the one with w >= 0.
 inline void see_from(double heading, std::span<const double> observation, float* seen) {
     const double c = std::cos(heading), s = std::sin(heading);
     const double turn_w = std::cos(heading / 2), turn_z = -std::sin(heading / 2);  // a rotation by -heading about z
@@ -84,6 +56,14 @@ inline void see_from(double heading, std::span<const double> observation, float*
     for (size_t i = 0; i < 4; ++i) seen[1 + i] = static_cast<float>(turned[0] < 0 ? -turned[i] : turned[i]);
     seen[13] = static_cast<float>(c * vx + s * vy);
     seen[14] = static_cast<float>(c * vy - s * vx);
+}
+
+// Moves an ant that has just been reset, [x, y] m.
+inline void move_start(MujocoEnvironment& body, MazePoint by) {
+    std::vector<double> qpos(body.data->qpos, body.data->qpos + body.model->nq);
+    const std::vector<double> qvel(body.data->qvel, body.data->qvel + body.model->nv);
+    for (size_t i = 0; i < 2; ++i) qpos[i] += by[i];
+    body.start(qpos, qvel);
 }
 
 // antmaze's ant far from all walls; the reward is its speed, m/s, in a direction that is drawn anew every 50 steps. An
@@ -105,11 +85,7 @@ struct WalkingAnt : Environment {
         episode = number;
         std::vector<float> ignored(body.observation.size());
         body.reset(chance, number, ignored.data());
-        std::vector<double> qpos(body.data->qpos, body.data->qpos + body.model->nq);
-        const std::vector<double> qvel(body.data->qvel, body.data->qvel + body.model->nv);
-        qpos[0] += away;
-        qpos[1] += away;
-        body.start(qpos, qvel);
+        move_start(body, {away, away});
         choose_direction();
         see_from(heading, body.observation, state);
     }
@@ -117,8 +93,7 @@ struct WalkingAnt : Environment {
     Step step(const float* action, float* state) override {
         const double* qpos = body.data->qpos;
         const double x = qpos[0], y = qpos[1];
-        std::vector<float> ignored(body.observation.size());
-        body.step(action, ignored.data());
+        body.advance(std::vector<double>(action, action + body.task->action_dim));
         const double speed = ((qpos[0] - x) * std::cos(heading) + (qpos[1] - y) * std::sin(heading)) / body.step_time();
         // The height of the torso's own z axis is 1 - 2 (qx^2 + qy^2).
         const bool upright = qpos[4] * qpos[4] + qpos[5] * qpos[5] < 0.5;
@@ -164,21 +139,14 @@ inline void relabel(CollectedRows<float>& set, MazePoint goal, bool once) {
 
 // The heading, rad, from the ant to the next cell's centre plus `scatter`, uniform [0, 1) per coordinate and drawn anew
 // in every step, or to the goal where that is in the next cell.
-inline double heading_to_goal(const AntPlan& plan, MazePoint at, MazePoint goal, MazePoint scatter) {
+inline double heading_to_goal(const MazePlan& plan, MazePoint at, MazePoint goal, MazePoint scatter) {
     const MazeCell cell = ant_cell_of(at[0], at[1]), end = ant_cell_of(goal[0], goal[1]);
     // Off the map, or behind its outermost walls, there is no next cell, and the ant heads for the goal.
-    const MazeCell next = plan.contains(cell) ? plan.next[plan.number(cell)] : end;
+    const MazeCell next = plan.grid.contains(cell.row, cell.column) ? plan.next[plan.grid.number(cell)] : end;
     MazePoint aim = goal;
     if (next.row >= 0 && !(next.row == end.row && next.column == end.column))
         for (size_t i = 0; i < 2; ++i) aim[i] = ant_cell_centre(next)[i] + scatter[i];
     return std::atan2(aim[1] - at[1], aim[0] - at[0]);
-}
-
-// A place in one of the cells: its centre plus uniform [0, 1) per coordinate. cell, place: sites of the draws.
-inline MazePoint draw_ant_place(const std::vector<MazeCell>& cells, const Random& random, uint64_t episode,
-                                uint32_t cell, uint32_t place) {
-    const MazeCell drawn = cells[random.below(cells.size(), episode, 0, cell)];
-    return scattered(ant_cell_centre(drawn), 0, 1, random, episode, 0, place);
 }
 
 // Row t has what was so before step t and that step's action, and, as in D4RL, infos/qpos and infos/qvel after it.
@@ -200,33 +168,31 @@ inline CollectedRows<float> collect_ant_maze_set(const MujocoTask& task, size_t 
     MujocoEnvironment environment(task, Physics::d4rl);
     Compute compute(best_kernel(), 1);
     Tape<float> tape(compute);
-    std::vector<float> state(29), seen(walking_ant_state), action(8);
-    const std::vector<float> mean_action(8);  // the walker's noise is 0
-    std::vector<MazeCell> starts = cells_marked(task.maze, '0');
-    append_all(starts, cells_marked(task.maze, 'R'));
-    std::vector<MazeCell> goals = starts;
-    append_all(goals, cells_marked(task.maze, 'G'));
-
+    std::vector<float> state(29), seen(walking_ant_state);
+    const std::vector<float> no_noise(8);  // of the walker's own
+    const MazeGrid grid{task.maze};
     CollectedRows<float> set;
     for (uint64_t episode = data_set_episodes; set.length() < steps; ++episode) {
         environment.reset(resets, episode, state.data());
         const std::span qpos(environment.data->qpos, 15), qvel(environment.data->qvel, 14);
         MazePoint goal = environment.goal;
         if (diverse) {
-            goal = draw_ant_place(goals, random, episode, AntDraw::goal_cell, AntDraw::goal);
-            const auto from = draw_ant_place(starts, random, episode, AntDraw::start_cell, AntDraw::start);
-            std::vector<double> start(qpos.begin(), qpos.end());
-            for (size_t i = 0; i < 2; ++i) start[i] += std::max(from[i], 0.0);
-            environment.start(start, std::vector<double>(qvel.begin(), qvel.end()));
+            const auto draw = [&](const std::vector<MazeCell>& cells, uint32_t cell, uint32_t place) {
+                const MazeCell drawn = cells[random.below(cells.size(), episode, 0, cell)];
+                return scattered(ant_cell_centre(drawn), 0, 1, random, episode, 0, place);
+            };
+            goal = draw(grid.cells("0RG"), AntDraw::goal_cell, AntDraw::goal);
+            const MazePoint start = draw(grid.cells("0R"), AntDraw::start_cell, AntDraw::start);
+            move_start(environment, {std::max(start[0], 0.0), std::max(start[1], 0.0)});
         }
-        const AntPlan plan(task.maze, ant_cell_of(goal[0], goal[1]));
+        const MazePlan plan(grid, ant_cell_of(goal[0], goal[1]));
         CollectedRows<float> rows;
         const auto step = [&](uint32_t t) {
             const std::vector<double>& o = environment.observation;
             append_all(rows.observations, o);
             const auto scatter = [&](uint32_t i) { return random.uniform(episode, t, AntDraw::waypoint + i); };
             see_from(heading_to_goal(plan, {o[0], o[1]}, goal, {scatter(0), scatter(1)}), o, seen.data());
-            sac::act(tape, walker, seen.data(), mean_action.data(), action.data());
+            std::vector<float> action = sac::act(tape, walker, seen.data(), no_noise).first;
             for (uint32_t i = 0; i < 8; ++i) {
                 const float noise = static_cast<float>(ant_noise) * random.normal(episode, t, AntDraw::noise + i);
                 action[i] = std::clamp(action[i] + noise, -1.0f, 1.0f);

@@ -73,17 +73,15 @@ struct LiveTask : Environment {
     MujocoEnvironment body;
     bool recording = true;
     CollectedRows<T> rows = {};
-    std::vector<float> whole_state;  // [task.state_dim] scratch
 
-    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl), whole_state(task.state_dim) {}
+    explicit LiveTask(const MujocoTask& task) : body(task, Physics::d4rl) {}
 
     EnvironmentSpec spec() const override {
-        EnvironmentSpec spec = body.spec();
-        spec.state_dim = live_columns(*body.task);
-        return spec;
+        return {live_columns(*body.task), body.task->action_dim, 0, body.task->max_episode_steps};
     }
     void reset(const Random& random, uint64_t episode, float* state) override {
         rows = {};
+        std::vector<float> whole_state(body.observation.size());
         body.reset(random, episode, whole_state.data());
         std::copy_n(whole_state.begin(), live_columns(*body.task), state);
     }
@@ -93,8 +91,8 @@ struct LiveTask : Environment {
             append_all(rows.qpos, std::span(body.data->qpos, body.model->nq));
             append_all(rows.qvel, std::span(body.data->qvel, body.model->nv));
         }
-        const Step result = body.step(action, whole_state.data());
-        std::copy_n(whole_state.begin(), live_columns(*body.task), state);
+        const Step result = body.advance(std::vector<double>(action, action + body.task->action_dim));
+        std::copy_n(body.observation.begin(), live_columns(*body.task), state);
         if (!recording) return result;
         append_all(rows.next_observations, body.observation);
         append_all(rows.actions, std::span(action, body.task->action_dim));
@@ -154,6 +152,12 @@ inline Moments sampled_returns(Tape<float>& tape, sac::Network<float>& policy, E
 constexpr uint64_t training_evaluations = uint64_t{1} << 40;  // the numbers of their episodes, the same at each
 constexpr double checkpoint_interval = 60;                    // seconds
 
+inline std::string fixed(double x, int digits) {
+    char text[40];
+    std::snprintf(text, sizeof text, "%.*f", digits, x);
+    return text;
+}
+
 // Whether the learner's policy is at the level: a quarter of the episodes must come within four times the tolerance,
 // then the whole number within the tolerance. `returns`: of the evaluation that decided.
 inline bool is_at_level(sac::Learner& learner, Environment& environment, const Training& training, Moments& returns) {
@@ -194,21 +198,17 @@ inline Moments train_to_level(sac::Learner& learner, Environment& environment, c
         const bool stop = watch.stop();
         if (p.steps % 1000 != 0 && !stop) continue;
         const double rate = static_cast<double>(p.updates - first_update) / std::max(1e-3, seconds_since(began));
-        char numbers[160];
-        int used =
-            std::snprintf(numbers, sizeof numbers, "update %llu, step %llu, %.0f updates a second",
-                          static_cast<unsigned long long>(p.updates), static_cast<unsigned long long>(p.steps), rate);
-        if (returns.count > 0)
-            std::snprintf(numbers + used, sizeof numbers - used, ", return %.0f of %.0f", returns.mean(),
-                          training.level);
+        std::string numbers = "update " + std::to_string(p.updates) + ", step " + std::to_string(p.steps);
+        numbers += ", " + fixed(rate, 0) + " updates a second";
+        if (returns.count > 0) numbers += ", return " + fixed(returns.mean(), 0) + " of " + fixed(training.level, 0);
         watch.show("training", std::clamp(best / training.level, 0.0, 0.99), numbers);
         if (!stop && seconds_since(saved) <= checkpoint_interval) continue;
         sac::save_checkpoint(checkpoint, learner, training.name);
         saved = Clock::now();
         if (stop)
             fail("collect.stopped",
-                 "stopped after update %llu; everything is saved in %s, and the same command continues",
-                 static_cast<unsigned long long>(p.updates), checkpoint.c_str());
+                 "stopped after update %s; everything is saved in %s, and the same command continues",
+                 std::to_string(p.updates).c_str(), checkpoint.c_str());
     }
     sac::save_checkpoint(checkpoint, learner, training.name);
     return returns;
@@ -219,16 +219,11 @@ inline sac::Learner train_policy(Environment& environment, const Training& train
                                  const std::string& path, const std::string& checkpoint, const Watch& watch) {
     sac::Learner learner(training.settings, environment.spec(), compute);
     const Moments returns = train_to_level(learner, environment, training, checkpoint, watch);
-    const auto number = [](double x) {
-        char text[40];
-        std::snprintf(text, sizeof text, "%.2f", x);
-        return std::string(text);
-    };
     sac::save_policy(path, learner.policy,
                      {{"name", training.name},
                       {"physics", "d4rl"},
-                      {"return", number(returns.mean())},
-                      {"return_deviation", number(returns.deviation())},
+                      {"return", fixed(returns.mean(), 2)},
+                      {"return_deviation", fixed(returns.deviation(), 2)},
                       {"seed", std::to_string(training.settings.seed)},
                       {"steps", std::to_string(learner.progress.steps)},
                       {"updates", std::to_string(learner.progress.updates)}});
@@ -320,8 +315,8 @@ inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTa
         environment.recording = back <= steps;
         environment.step(replay.action(row), state.data());
         if (!std::equal(state.begin(), state.end(), replay.next_state(row)))
-            fail("collect.replay", "episode %llu went another way when it was played again",
-                 static_cast<unsigned long long>(episode_of(back)));
+            fail("collect.replay", "episode %s went another way when it was played again",
+                 std::to_string(episode_of(back)).c_str());
         if (back > 1 && episode_of(back) == episode_of(back - 1)) continue;
         // Cut by a breakdown of the simulation, or by the end of the run: a timeout, as at the end of D4RL's blocks.
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;
@@ -353,8 +348,7 @@ inline void collect_medium_replay(const std::string& path, const MujocoTask& tas
 
 // Calls train(checkpoint) with a path in the folder PATH.training, which is locked meanwhile. Once it has returned, the
 // checkpoint is removed, and the folder too unless it holds other files. After an error all stays, to continue from.
-template <class Train>
-void train_in_folder(const std::string& path, Train&& train) {
+void train_in_folder(const std::string& path, auto&& train) {
     const std::string folder = path + ".training", checkpoint = folder + "/checkpoint.safetensors";
     make_folder(folder, "collect.folder");
     const FolderLock lock(folder);

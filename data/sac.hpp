@@ -73,8 +73,7 @@ struct Replay {
     }
     void cut_last() { rows[recent(1) * width() + state_dim + action_dim + 1] = static_cast<float>(End::cut); }
 
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("replay.next", next);
         archive("replay.rows", rows);
         if (rows.size() % width() != 0 || size() > capacity || (size() < capacity ? next != size() : next >= capacity))
@@ -91,11 +90,11 @@ struct Network {
 
     // rlkit's initialisation: hidden weights uniform in +-1 / sqrt(outputs) (rlkit takes the wrong side of the matrix
     // for its fan-in), hidden biases 0.1, last layer uniform in +-last_range. first_tensor: the first one's number.
-    Network(int in, int hidden, int out, double last_range, uint32_t seed, uint64_t first_tensor) {
+    Network(uint64_t in, uint64_t hidden, uint64_t out, double last_range, uint32_t seed, uint64_t first_tensor) {
         const Random random{seed, Stream::initialisation};
-        const auto add = [&](const char* name, const std::vector<int>& shape, double range) {
+        const auto add = [&](const char* name, const Shape& shape, double range) {
             const size_t size = shape[0] * (shape.size() == 2 ? shape[1] : 1);
-            Parameter<T> p{name, {shape.begin(), shape.end()}, std::vector<T>(size, T(0.1)), std::vector<T>(size)};
+            Parameter<T> p{name, shape, std::vector<T>(size, T(0.1)), std::vector<T>(size)};
             for (uint32_t i = 0; range > 0 && i < size; ++i)
                 p.value[i] = static_cast<T>(range * (2 * random.uniform(first_tensor + parameters.size(), i) - 1));
             parameters.push_back(std::move(p));
@@ -187,11 +186,9 @@ struct Sample {
 // which rlkit clamps to [-20, 2]. noise [n, A]: standard normal. The gradient goes through the actions alone.
 template <class T>
 Sample<T> draw(Tape<T>& tape, Tensor<T> states, Tensor<T> output, const float* noise) {
-    const ptrdiff_t S = states.columns, A = output.columns / 2, width = S + A;
-    const Tensor<T> pairs = tape.make(output.rows, states.columns + output.columns / 2);
-    const Tensor<T> log_prob = tape.make(output.rows, 1),
-                    normal = tape.constant(noise, output.rows, output.columns / 2);
-    for (ptrdiff_t row = 0; row < output.rows; ++row) {
+    const int n = output.rows, S = states.columns, A = output.columns / 2, width = S + A;
+    const Tensor<T> pairs = tape.make(n, width), log_prob = tape.make(n, 1), normal = tape.constant(noise, n, A);
+    for (ptrdiff_t row = 0; row < n; ++row) {
         const T *mean = output.value + row * 2 * A, *l = mean + A, *z = normal.value + row * A;
         T* const action = std::copy_n(states.value + row * S, S, pairs.value + row * width);
         log_prob.value[row] = 0;
@@ -204,7 +201,7 @@ Sample<T> draw(Tape<T>& tape, Tensor<T> states, Tensor<T> output, const float* n
     tape.on_backward({}, [=] {  // there are two results, so the step is never skipped
         const T *d_pairs = gradient_of(pairs), *d_log_prob_of = gradient_of(log_prob);
         T* const d_output = gradient_of(output);
-        for (ptrdiff_t i = 0; i < output.rows * A; ++i) {
+        for (ptrdiff_t i = 0; i < ptrdiff_t{n} * A; ++i) {
             const ptrdiff_t action = i / A * width + S + i % A, mean = i / A * 2 * A + i % A, l = mean + A;
             const T a = pairs.value[action], d_log_prob = d_log_prob_of[i / A], log_std = output.value[l];
             const T du = (T(1) - a * a) * d_pairs[action] + T(2) * a * d_log_prob;
@@ -289,32 +286,34 @@ EACH_TARGET inline void soft_update(std::vector<float>& target, const std::vecto
 // ---------------------------------------------------------------------------------------------------------------------
 // Acting.
 
-// Writes the policy's action [A] at a state [S] and returns its log-probability (D4RL's infos/action_log_probs).
-// noise [A]: standard normal, or zeros for the mean action. The tape is emptied and stops recording.
-inline float act(Tape<float>& tape, Network<float>& policy, const float* state, const float* noise, float* action) {
+using ActionAndLogProb = std::pair<std::vector<float>, float>;  // [A]; D4RL's infos/action_log_probs
+
+// The policy's action at a state [S]. noise [A]: standard normal, or zeros for the mean action. The tape is emptied and
+// stops recording.
+inline ActionAndLogProb act(Tape<float>& tape, Network<float>& policy, const float* state,
+                            const std::vector<float>& noise) {
     tape.reset();
     tape.recording = false;
     const Tensor<float> states = tape.constant(state, 1, policy.inputs());
-    const Sample<float> sample = draw(tape, states, forward(tape, policy, states), noise);
-    std::copy_n(sample.pairs.value + policy.inputs(), policy.outputs() / 2, action);
-    return sample.log_prob.value[0];
+    const Sample<float> sample = draw(tape, states, forward(tape, policy, states), noise.data());
+    const float* values = sample.pairs.value + policy.inputs();
+    return {{values, values + noise.size()}, sample.log_prob.value[0]};
 }
 
 // The same with the noise of a time-step of an episode.
-inline float act_sampled(Tape<float>& tape, Network<float>& policy, const float* state, uint32_t seed, uint64_t episode,
-                         uint32_t t, float* action) {
+inline ActionAndLogProb act_sampled(Tape<float>& tape, Network<float>& policy, const float* state, uint32_t seed,
+                                    uint64_t episode, uint32_t t) {
     std::vector<float> noise(policy.outputs() / 2);
     for (uint32_t i = 0; i < noise.size(); ++i) noise[i] = Random{seed, Stream::exploration}.normal(episode, t, i);
-    return act(tape, policy, state, noise.data(), action);
+    return act(tape, policy, state, noise);
 }
 
 // Plays an episode with sampled actions, and appends their log-probabilities to `log_probs` if it is given.
 inline Episode play_sampled(Tape<float>& tape, Network<float>& policy, Environment& environment, uint32_t seed,
                             uint64_t number, std::vector<float>* log_probs = nullptr) {
     return play(environment, {seed, Stream::environment}, number, [&](const Episode& episode) {
-        std::vector<float> action(policy.outputs() / 2);
-        const float log_prob =
-            act_sampled(tape, policy, episode.state.data(), seed, number, episode.trajectory.length(), action.data());
+        const int t = episode.trajectory.length();
+        const auto [action, log_prob] = act_sampled(tape, policy, episode.state.data(), seed, number, t);
         if (log_probs) log_probs->push_back(log_prob);
         return action;
     });
@@ -328,29 +327,26 @@ struct Progress {
     uint64_t episode_steps = 0;                     // of the present episode so far
 };
 
-// Of one update; entropy: mean -log pi(a | s).
-struct Losses {
-    double critic = NAN, policy = NAN, alpha = NAN, entropy = NAN;
-};
-
 struct Learner {
     Settings settings;
     EnvironmentSpec spec;
     Tape<float> learning, acting;
-    Losses last;  // of the latest update, for tests
 
     // The state of the run, all of it saved by visit(). The environment's own state is not: resume() restores it.
     Progress progress;
-    std::vector<float> state = std::vector<float>(spec.state_dim);  // of the environment
-    Network<float> policy{spec.state_dim, settings.hidden, 2 * spec.action_dim, 1e-3, settings.seed, 0};  // m, then l
+    std::vector<float> state = std::vector<float>(spec.state_dim);                  // of the environment
+    Network<float> policy = network(spec.state_dim, 2 * spec.action_dim, 1e-3, 0);  // m, then l
     Pair<float> critics{critic(6), critic(12)}, targets = critics;
     std::vector<Parameter<float>> log_alpha{{"log_alpha", {1}, {0.0f}, {0.0f}}};  // one; alpha starts at 1
     Optimizer policy_optimizer, alpha_optimizer;
     std::array<Optimizer, 2> critic_optimizers;
     Replay replay{spec.state_dim, spec.action_dim, settings.capacity};
 
+    Network<float> network(int in, int out, double last_range, uint64_t first_tensor) const {
+        return Network<float>(in, settings.hidden, out, last_range, settings.seed, first_tensor);
+    }
     Network<float> critic(uint64_t first_tensor) const {
-        return {spec.state_dim + spec.action_dim, settings.hidden, 1, 3e-3, settings.seed, first_tensor};
+        return network(spec.state_dim + spec.action_dim, 1, 3e-3, first_tensor);
     }
 
     // Errors: sac.settings.
@@ -371,9 +367,8 @@ struct Learner {
     // One step of the environment, then an update at every steps_per_update-th step after the random ones.
     void step(Environment& environment) {
         interact(environment);
-        if (progress.steps > settings.random_steps && progress.steps % settings.steps_per_update == 0 &&
-            replay.size() > 0)
-            update();
+        const bool due = progress.steps > settings.random_steps && progress.steps % settings.steps_per_update == 0;
+        if (due && replay.size() > 0) update();
     }
 
     // One step of the environment into the replay. play() of memory.hpp would not do: updates come between the steps of
@@ -386,7 +381,7 @@ struct Learner {
         const uint32_t t = static_cast<uint32_t>(p.episode_steps);
         std::vector<float> action(spec.action_dim), next_state(state.size());
         if (p.steps >= settings.random_steps)
-            act_sampled(acting, policy, state.data(), settings.seed, p.episodes, t, action.data());
+            action = act_sampled(acting, policy, state.data(), settings.seed, p.episodes, t).first;
         else
             for (uint32_t i = 0; i < action.size(); ++i)
                 action[i] = static_cast<float>(2 * random.uniform(p.episodes, t, i) - 1);
@@ -409,7 +404,8 @@ struct Learner {
     }
 
     // SAC algorithm 1, in rlkit's order: first the temperature, then all networks, each with gradients at the old ones.
-    void update() {
+    // Returns the losses of critics and policy.
+    std::pair<float, float> update() {
         const Random rows{settings.seed, Stream::batch}, normals{settings.seed, Stream::entropy_noise};
         const uint64_t number = progress.updates++;
         const size_t A = spec.action_dim, n = settings.batch;
@@ -436,10 +432,7 @@ struct Learner {
                 soft_update(targets[k].parameters[i].value, critics[k].parameters[i].value,
                             static_cast<float>(settings.target_rate));
         }
-        double log_prob = 0;
-        for (size_t i = 0; i < n; ++i) log_prob += static_cast<double>(sample.log_prob.value[i]);
-        last = {static_cast<double>(critic.value[0]), static_cast<double>(actor.value[0]), static_cast<double>(alpha),
-                -log_prob / static_cast<double>(n)};
+        return {critic.value[0], actor.value[0]};
     }
 
     void adam(std::vector<Parameter<float>>& parameters, Optimizer& optimizer) {
@@ -459,12 +452,11 @@ struct Learner {
         for (uint64_t back = progress.episode_steps; back > 0; --back)
             environment.step(replay.action(replay.recent(back)), found.data());
         if (found != state)
-            fail("sac.resume", "the present episode (%llu) went another way; resume on the machine that began it",
-                 static_cast<unsigned long long>(progress.episodes));
+            fail("sac.resume", "the present episode (%s) went another way; resume on the machine that began it",
+                 std::to_string(progress.episodes).c_str());
     }
 
-    template <class Archive>
-    void visit(Archive& archive) {
+    void visit(auto& archive) {
         archive("progress.steps", progress.steps);
         archive("progress.updates", progress.updates);
         archive("progress.episodes", progress.episodes);
@@ -480,34 +472,34 @@ struct Learner {
         }
         replay.visit(archive);
         if (progress.episode_steps > replay.size())
-            fail("checkpoint.shape", "an episode of %llu steps is not in the replay",
-                 static_cast<unsigned long long>(progress.episode_steps));
+            fail("checkpoint.shape", "an episode of %s steps is not in the replay",
+                 std::to_string(progress.episode_steps).c_str());
     }
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Files: a checkpoint is the whole state; a policy has the names and shapes of D4RL's metadata/policy.
 
-// The settings that must agree between a checkpoint and the run that loads it, on one line.
-inline std::string settings_text(const Learner& learner) {
+// What must agree between a checkpoint and the run that loads it, on one line. `note`: a text of the caller's, the
+// task's name for instance.
+inline std::string settings_text(const Learner& learner, const std::string& note) {
     const Settings& s = learner.settings;
     char text[400];
     std::snprintf(text, sizeof text,
                   "seed=%u hidden=%d batch=%d capacity=%llu random_steps=%llu steps_per_update=%llu "
                   "learning_rate=%.17g discount=%.17g target_rate=%.17g reward_scale=%.17g state_dim=%d "
-                  "action_dim=%d max_episode_steps=%d kernel=%s",
+                  "action_dim=%d max_episode_steps=%d kernel=%s ",
                   s.seed, s.hidden, s.batch, static_cast<unsigned long long>(s.capacity),
                   static_cast<unsigned long long>(s.random_steps), static_cast<unsigned long long>(s.steps_per_update),
                   s.learning_rate, s.discount, s.target_rate, s.reward_scale, learner.spec.state_dim,
                   learner.spec.action_dim, learner.spec.max_episode_steps, learner.learning.compute.kernel.arithmetic);
-    return text;
+    return text + note;
 }
 
-// `note`: a text of the caller's, the task's name for instance; load_checkpoint() requires the same one.
 inline void save_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
     TensorFile file;
     file.metadata["format"] = "wodtem sac checkpoint 2";
-    file.metadata["settings"] = settings_text(learner) + " " + note;
+    file.metadata["settings"] = settings_text(learner, note);
     file.buffer.reserve(learner.replay.rows.size() * sizeof(float) + (16 << 20));
     Saver saver{file};
     learner.visit(saver);
@@ -520,7 +512,7 @@ inline void load_checkpoint(const std::string& path, Learner& learner, const std
     const TensorFile file = read_own_safetensors(path);
     if (file.text("format") != "wodtem sac checkpoint 2")
         fail("sac.checkpoint", "%s: is not a SAC checkpoint of this version; remove it to train anew", path.c_str());
-    const std::string wanted = settings_text(learner) + " " + note;
+    const std::string wanted = settings_text(learner, note);
     if (file.text("settings") != wanted)
         fail("sac.checkpoint", "%s: was made with %s, this run has %s", path.c_str(), file.text("settings").c_str(),
              wanted.c_str());
@@ -530,8 +522,7 @@ inline void load_checkpoint(const std::string& path, Learner& learner, const std
 
 // Calls f(name, shape, values) for fc0.weight [256, S], fc0.bias, fc1.*, last_fc.* [A, 256] (the means) and
 // last_fc_log_std.*: D4RL's names and PyTorch's layout. `parameters` may be const.
-template <class Parameters, class F>
-void each_policy_tensor(Parameters& parameters, F&& f) {
+void each_policy_tensor(auto& parameters, auto&& f) {
     for (size_t i = 0; i < 4; ++i) f(parameters[i].name, parameters[i].shape, std::span(parameters[i].value));
     for (size_t half = 0; half < 2; ++half)
         for (size_t i = 4; i < 6; ++i) {
@@ -563,8 +554,7 @@ inline Network<float> policy_of(const TensorFile& file) {
     if (first.size() != 2 || last.size() != 2 || too_large(first[0]) || too_large(first[1]) || too_large(last[0]))
         fail("sac.policy", "%s: fc0.weight %s and last_fc.weight %s are not those of a policy", file.path.c_str(),
              shape_text(first).c_str(), shape_text(last).c_str());
-    Network<float> policy(static_cast<int>(first[1]), static_cast<int>(first[0]), static_cast<int>(2 * last[0]), 1, 0,
-                          0);
+    Network<float> policy(first[1], first[0], 2 * last[0], 1, 0, 0);
     each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.read_into(values, name, shape);
     });

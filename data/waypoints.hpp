@@ -11,67 +11,74 @@
 #include "rows.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The grid model. Cells are the characters of the map; number of a cell: row + column * rows. Row is x, column is y.
-
-constexpr std::array<MazeCell, 5> maze_moves{{{0, 0}, {0, -1}, {0, 1}, {-1, 0}, {1, 0}}};  // the order decides ties
+// The planner. Cells are the characters of the map. In maze2d row is x and column is y, in antmaze the other way round.
 
 struct MazeGrid {
-    int rows = 0, columns = 0;
-    std::vector<MazeCell> open;  // the cells that starts and targets are drawn from, D4RL's order: free ones, the goal
-    std::vector<std::array<int, maze_moves.size()>> next;  // [rows * columns][move] where a move leads
+    std::string_view map;
+    int columns = static_cast<int>(map.find('/')), rows = static_cast<int>(map.size()) / (columns + 1);
 
-    explicit MazeGrid(std::string_view map) : open(cells_marked(map, '0')) {
-        columns = static_cast<int>(map.find('/'));
-        rows = static_cast<int>(map.size()) / (columns + 1);
-        append_all(open, cells_marked(map, 'G'));
-        // A move into a wall or off the map stays in its cell. A plan may start in a wall: the ball comes as near as
-        // 0.4 to a wall's centre, so its rounded position can be one, from which free neighbours can be entered.
-        next.resize(rows * columns);
-        for (int from = 0; from < rows * columns; ++from)
-            for (size_t move = 0; move < maze_moves.size(); ++move) {
-                const MazeCell to{cell(from).row + maze_moves[move].row, cell(from).column + maze_moves[move].column};
-                const bool enters = contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
-                next[from][move] = enters ? number(to) : from;
-            }
-    }
-
-    int number(MazeCell cell) const { return cell.row + cell.column * rows; }
-    MazeCell cell(int number) const { return {number % rows, number / rows}; }
+    // Whether a place is on the map; NaN is not.
     bool contains(double row, double column) const { return row >= 0 && row < rows && column >= 0 && column < columns; }
+    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
+    bool can_enter(MazeCell to) const {
+        return contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
+    }
+    // The cells with one of the marks, mark by mark.
+    std::vector<MazeCell> cells(std::string_view marks) const {
+        std::vector<MazeCell> all;
+        for (const char mark : marks) append_all(all, cells_marked(map, mark));
+        return all;
+    }
 };
 
-// ---------------------------------------------------------------------------------------------------------------------
-// The planner.
+// The shortest ways to a target, breadth first. They lead through no wall, but may start in one: the ball comes as near
+// as 0.4 to a wall's centre, so its rounded position can be one, and the ant's torso may be over a wall's corner.
+struct MazePlan {
+    static constexpr int no_way = std::numeric_limits<int>::max();
+    MazeGrid grid;
+    std::vector<int> distance;   // [cell] moves to the target, or no_way
+    std::vector<MazeCell> next;  // [cell] where the first move leads; the target's is itself; {-1, -1}: no way
 
-using MazeValues = std::vector<std::array<double, maze_moves.size()>>;  // Q [rows * columns][move]
-
-// Exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0, with R = 1 in the target and 0
-// elsewhere. After k sweeps V_k = (1 - 0.99^k) / 0.01 in the target (by staying), and 0.99^d V_(k-d) d moves away: less
-// with every move, so a greedy path of up to 49 moves is a shortest one. Cells of equal distance have equal values.
-inline MazeValues maze_values(const MazeGrid& grid, int target) {
-    MazeValues q(grid.next.size());
-    std::vector<double> v(q.size());  // max_b Q(s, b) of the sweep before
-    for (int sweep = 0; sweep < 50; ++sweep) {
-        for (size_t s = 0; s < q.size(); ++s) v[s] = std::ranges::max(q[s]);
-        for (size_t s = 0; s < q.size(); ++s)
-            for (size_t move = 0; move < maze_moves.size(); ++move)
-                q[s][move] = (static_cast<int>(s) == target ? 1.0 : 0.0) + 0.99 * v[grid.next[s][move]];
+    // Of the ways that are equally short `next` takes the first found, neighbours in the order left, right, down, up.
+    MazePlan(const MazeGrid& maze, MazeCell target)
+        : grid(maze),
+          distance(maze.rows * maze.columns, no_way),
+          next(distance.size(), {-1, -1}) {
+        std::vector<MazeCell> queue = {target};
+        distance[grid.number(target)] = 0;
+        next[grid.number(target)] = target;
+        for (size_t i = 0; i < queue.size(); ++i) {
+            const MazeCell at = queue[i];
+            if (!grid.can_enter(at)) continue;
+            for (const MazeCell move : {MazeCell{0, -1}, {0, 1}, {1, 0}, {-1, 0}}) {
+                const MazeCell to = {at.row + move.row, at.column + move.column};
+                if (!grid.contains(to.row, to.column) || distance[grid.number(to)] != no_way) continue;
+                distance[grid.number(to)] = distance[grid.number(at)] + 1;
+                next[grid.number(to)] = at;
+                queue.push_back(to);
+            }
+        }
     }
-    return q;
-}
 
-// The cell after each greedy move (ties: the lowest move), up to the target. At least one move is made, so from the
-// target itself the path is the target. If no path leads to the target, it is 100 times the start.
-inline std::vector<int> greedy_path(const MazeGrid& grid, const MazeValues& q, int start, int target) {
-    std::vector<int> path;
-    int cell = start;
-    do {
-        const auto best = std::ranges::max_element(q[cell]) - q[cell].begin();  // the first of equals
-        cell = grid.next[cell][best];
-        path.push_back(cell);
-    } while (cell != target && path.size() < 100);
-    return path;
-}
+    // The cell after each move of maze2d's plan, up to the target; of the moves that come nearer the first in the order
+    // left, right, up, down. At least one move is made, so from the target itself the path is the target. If no way
+    // leads to the target, it is 100 times the start.
+    // D4RL follows the largest Q after exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0,
+    // with R = 1 in the target and 0 elsewhere; of equals the first, in this order behind staying. Cells of equal
+    // distance have equal values and nearer ones greater, up to 49 moves: the same path. The tests compare the two.
+    std::vector<MazeCell> path(MazeCell at) const {
+        std::vector<MazeCell> cells;
+        do {
+            MazeCell nearest = at;
+            for (const MazeCell move : {MazeCell{0, -1}, {0, 1}, {-1, 0}, {1, 0}}) {
+                const MazeCell to = {at.row + move.row, at.column + move.column};
+                if (grid.can_enter(to) && distance[grid.number(to)] < distance[grid.number(nearest)]) nearest = to;
+            }
+            cells.push_back(at = nearest);
+        } while (distance[grid.number(at)] > 0 && cells.size() < 100);
+        return cells;
+    }
+};
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The controller. Positions in observed coordinates, m; velocities in m/s.
@@ -108,23 +115,17 @@ struct WaypointController {
     static constexpr double position_gain = 10, velocity_gain = -1;
 
     MazeGrid grid;
-    Random random;                   // site: MazeDraw::waypoint
-    uint64_t plans = 0;              // made so far
-    std::vector<MazeValues> values;  // [rows * columns] Q of each target, empty until it is first needed
-    std::optional<MazeCell> target;  // none before the first call, which therefore plans
-    std::vector<MazePoint> waypoints;
-    size_t at = 0;         // the index of the present way-point
-    MazePoint previous{};  // position of the last call
-
-    WaypointController(const MazeGrid& maze, const Random& chance)
-        : grid(maze),
-          random(chance),
-          values(maze.next.size()) {}
+    Random random;                        // site: MazeDraw::waypoint
+    uint64_t plans = 0;                   // made so far
+    std::optional<MazeCell> target = {};  // none before the first call, which therefore plans
+    std::vector<MazePoint> waypoints = {};
+    size_t at = 0;            // the index of the present way-point
+    MazePoint previous = {};  // position of the last call
 
     // The force at a position and velocity towards a target, whose cell alone matters. Plans if the cell is a new one.
     WaypointAction act(MazePoint position, MazePoint velocity, MazePoint wanted) {
         const MazeCell to = cell_of(wanted);
-        if (!target || target->row != to.row || target->column != to.column) plan(position, to);
+        if (!target || grid.number(*target) != grid.number(to)) plan(position, to);
         const double distance = maze_distance(position, whole_point(to)), speed = maze_distance(position, previous);
         const bool solved = distance < near && speed < slow;
         const MazePoint aim = solved ? whole_point(to) : waypoints[at];
@@ -141,19 +142,18 @@ struct WaypointController {
     // Plans from the cell of `position`. The target's way-point is its cell, each other one is its cell minus uniform
     // [0, 0.2): on average half the way from the whole numbers to the corridor's middle, which is at -0.2.
     void plan(MazePoint position, MazeCell to) {
-        const int start = grid.number(cell_of(position)), end = grid.number(to);
-        MazeValues& q = values[end];
-        if (q.empty()) q = maze_values(grid, end);
+        const MazeCell start = cell_of(position);
         waypoints.clear();
-        for (const int cell : greedy_path(grid, q, start, end)) {
-            const MazePoint centre = whole_point(grid.cell(cell));
+        for (const MazeCell cell : MazePlan(grid, to).path(start)) {
+            const MazePoint centre = whole_point(cell);
             const uint32_t move = static_cast<uint32_t>(waypoints.size());
-            waypoints.push_back(cell == end ? centre
-                                            : scattered(centre, 0, -scatter, random, plans, move, MazeDraw::waypoint));
+            const bool last = grid.number(cell) == grid.number(to);
+            waypoints.push_back(last ? centre
+                                     : scattered(centre, 0, -scatter, random, plans, move, MazeDraw::waypoint));
         }
         at = 0;
         target = to;
-        previous = whole_point(grid.cell(start));  // as D4RL's; the first call's speed is then no real speed
+        previous = whole_point(start);  // as D4RL's; the first call's speed is then no real speed
         ++plans;
     }
 
@@ -171,19 +171,13 @@ struct WaypointController {
 inline MazeGrid maze2d_grid(const MujocoTask& task) {
     if (task.rules != Rules::maze2d)
         fail("waypoints.not_maze2d", "the way-point controller drives maze2d tasks, not %s", task.name);
-    return MazeGrid(task.maze);
+    return {task.maze};
 }
 
 #ifdef WODTEM_MUJOCO
 
 // ---------------------------------------------------------------------------------------------------------------------
 // The data set.
-
-// Target `number`: a free cell or the goal's, plus uniform [-0.1, 0.1) per coordinate.
-inline MazePoint draw_maze_target(const MazeGrid& grid, const Random& random, uint64_t number) {
-    const MazeCell cell = grid.open[random.below(grid.open.size(), number, 0, MazeDraw::target_cell)];
-    return scattered(whole_point(cell), -0.1, 0.2, random, number, 0, MazeDraw::target_place);
-}
 
 // With --noisy D4RL's script adds this times a standard normal to every action and clips again. The published files'
 // names do not say "noisy", but maze2d-umaze-v1 has 12459 timeouts in 10^6 rows. Over six seeds (mean, standard
@@ -204,13 +198,18 @@ inline CollectedRows<float> collect_maze_data_set(const MujocoTask& task, size_t
                                                   double noise = published_noise) {
     const Random random{seed, Stream::data_set};
     const MazeGrid grid = maze2d_grid(task);
-    WaypointController controller(grid, random);
+    const std::vector<MazeCell> open = grid.cells("0G");  // D4RL's order: free cells, the goal
+    WaypointController controller{grid, random};
     MujocoEnvironment environment(task, Physics::d4rl);
     CollectedRows<float> rows;
     std::array<float, 4> state;
     environment.reset(Random{seed, Stream::environment}, data_set_episodes, state.data());
-    uint64_t targets = 0;
-    MazePoint target = draw_maze_target(grid, random, targets++);
+    const auto draw_target = [&](uint64_t number) {  // an open cell, plus uniform [-0.1, 0.1) per coordinate
+        const MazeCell cell = open[random.below(open.size(), number, 0, MazeDraw::target_cell)];
+        return scattered(whole_point(cell), -0.1, 0.2, random, number, 0, MazeDraw::target_place);
+    };
+    uint64_t targets = 1;  // drawn so far
+    MazePoint target = draw_target(0);
     int since_target = 0;  // steps made under this target
     while (rows.length() < steps) {
         const std::vector<double>& o = environment.observation;
@@ -234,7 +233,7 @@ inline CollectedRows<float> collect_maze_data_set(const MujocoTask& task, size_t
         environment.step(&rows.actions[rows.actions.size() - 2], state.data());
         ++since_target;
         if (next_target) {
-            target = draw_maze_target(grid, random, targets++);
+            target = draw_target(targets++);
             since_target = 0;
         }
         if (progress && rows.length() % 10000 == 0) progress(rows.length());

@@ -997,7 +997,7 @@ Table empty_table(Case& c) {
     const bool projects = c.has("in/projection");
     const Array<double> projection =
         projects ? c.in<double>("projection", {any, states.shape[1]}) : Array<double>{{0, 0}, {}};
-    check_finite("projection", projection.values.data(), projection.values.size());
+    check_column("projection", projection.values, projection.shape[0], projection.shape[1]);
     EpisodicMemory memory(memory_settings(c, states.extent(1), actions.extent(1), projection.extent(0), n), 0);
     memory.projection = projection.values;
     return {states, actions, e, std::move(memory)};
@@ -1425,9 +1425,9 @@ void check_sampling(Case& c) {
                         draws.values[2 * i + 1] >= buffer.trajectories[draws.values[2 * i]].length()))
             fail("check.value", "%s: case %s: draw %zu names no step of the buffer", c.file.path.c_str(),
                  c.name.c_str(), i);
-        const Window window =
-            uniform ? buffer.window_of(draws.values[2 * i], static_cast<int>(draws.values[2 * i + 1]), context_length)
-                    : buffer.window_at(static_cast<uint64_t>(draws.values[i]), context_length);
+        uint64_t step = static_cast<uint64_t>(draws.values[uniform ? 2 * i + 1 : i]);
+        if (uniform && draws.values[2 * i] > 0) step += buffer.ends[draws.values[2 * i] - 1];
+        const Window window = buffer.window_at(step, context_length);
         trajectory.push_back(static_cast<int>(window.trajectory));
         start.push_back(window.start);
         length.push_back(window.length);

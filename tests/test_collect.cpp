@@ -46,30 +46,32 @@ TEST(ant_plan_takes_a_shortest_way_from_every_cell) {
         for (size_t goal = 0; goal < text.size(); ++goal) {
             if (text[goal] == '/' || text[goal] == '1') continue;
             const MazeCell end = {static_cast<int>(goal) / (columns + 1), static_cast<int>(goal) % (columns + 1)};
-            const AntPlan plan(map, end);
+            const MazePlan plan({map}, end);
             const std::vector<int> distance = brute_force_distances(text, columns, end);
             CHECK_EQUAL(plan.next.size(), distance.size());
             for (size_t i = 0; i < distance.size(); ++i) {
                 const MazeCell next = plan.next[i];
                 if (distance[i] == 1 << 20) CHECK(next.row == -1 && next.column == -1);
                 if (distance[i] == 1 << 20 || distance[i] == 0) continue;
-                CHECK(plan.contains(next));
-                CHECK_EQUAL(distance[plan.number(next)], distance[i] - 1);
+                CHECK(plan.grid.contains(next.row, next.column));
+                CHECK_EQUAL(distance[plan.grid.number(next)], distance[i] - 1);
+                CHECK_EQUAL(plan.distance[i], distance[i]);
                 CHECK_EQUAL(std::abs(next.row - static_cast<int>(i) / columns) +
                                 std::abs(next.column - static_cast<int>(i) % columns),
                             1);
             }
-            CHECK(plan.next[plan.number(end)].row == end.row && plan.next[plan.number(end)].column == end.column);
+            const MazeCell at_end = plan.next[plan.grid.number(end)];
+            CHECK(at_end.row == end.row && at_end.column == end.column);
         }
     }
 }
 
 TEST(ant_plan_breaks_ties_in_the_order_left_right_down_up) {
     // From the middle of an open room its corners are reached first from the left and the right neighbour.
-    const AntPlan plan("11111/10001/10001/10001/11111/", {2, 2});
+    const MazePlan plan({"11111/10001/10001/10001/11111/"}, {2, 2});
     for (const int row : {1, 3})
         for (const int column : {1, 3}) {
-            const MazeCell next = plan.next[plan.number({row, column})];
+            const MazeCell next = plan.next[plan.grid.number({row, column})];
             CHECK(next.row == 2 && next.column == column);
         }
 }
@@ -111,7 +113,7 @@ struct Scratch {
 
 TEST(ant_is_sent_to_the_next_cell_and_at_last_to_the_goal) {
     const std::array<double, 2> goal = {0.75, 8.5};  // in the cell (3, 1)
-    const AntPlan plan(ant_umaze_map, ant_cell_of(goal[0], goal[1]));
+    const MazePlan plan({ant_umaze_map}, ant_cell_of(goal[0], goal[1]));
     // From the start to the cell (1, 2), whose centre is (4, 0); down the right side, (3, 3) at (8, 8).
     CHECK_CLOSE(heading_to_goal(plan, {0, 0}, goal, {0.25, 0.5}), std::atan2(0.5, 4.25), 1e-15);
     CHECK_CLOSE(heading_to_goal(plan, {8.5, 4.5}, goal, {0.25, 0.5}), std::atan2(4.0, -0.25), 1e-15);
@@ -500,12 +502,11 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     whole.parameters = network.parameters;
     whole.parameters[0] = {"fc0.weight", {256, 111}, weights, std::vector<float>(weights.size())};
     Tape<float> tape(one_thread());
-    std::vector<float> action(8);
     Random normals{test_seed(), Stream::exploration};
     for (uint32_t t = 0; t < 20; ++t) {
         std::vector<float> noise(8);
         for (uint32_t i = 0; i < 8; ++i) noise[i] = normals.normal(data_set_episodes, t, i);
-        const float log_prob = sac::act(tape, whole, rows.observation(t), noise.data(), action.data());
+        const auto [action, log_prob] = sac::act(tape, whole, rows.observation(t), noise);
         CHECK_CLOSE(log_prob, log_probs[t], 1e-4);
         for (size_t i = 0; i < 8; ++i) CHECK_CLOSE(action[i], rows.actions[8 * t + i], 1e-5);
     }

@@ -244,30 +244,16 @@ enum class Shape { uniform, lattice, clusters, walk, line, point };
 // State i of a sequence that fills space evenly, on a lattice with many ties (some states in it twice), in few small
 // heaps, along a path, along an axis from left to right, or not at all.
 std::vector<float> state_of(Shape shape, const Random& random, int dim, uint64_t i) {
-    std::vector<float> state;
-    for (uint32_t d = 0; d < static_cast<uint32_t>(dim); ++d) {
+    const auto coordinate = [&](uint32_t d) {
         const auto x = static_cast<float>(random.uniform(i, d));
-        switch (shape) {
-            case Shape::uniform:
-                state.push_back(4 * x);
-                break;
-            case Shape::lattice:
-                state.push_back(std::floor(x * (d < 2 ? 32 : 4)) / 8);
-                break;
-            case Shape::clusters:
-                state.push_back(4 * static_cast<float>(random.uniform(i % 7, d)) + x * 1e-3f);
-                break;
-            case Shape::walk:
-                state.push_back(2 + 2 * std::sin(0.01f * static_cast<float>(i * (d + 1))) + x * 0.02f);
-                break;
-            case Shape::line:
-                state.push_back(d == 0 ? static_cast<float>(i) * 0.01f : 1.0f);
-                break;
-            case Shape::point:
-                state.push_back(1.0f);
-                break;
-        }
-    }
+        if (shape == Shape::uniform) return 4 * x;
+        if (shape == Shape::lattice) return std::floor(x * (d < 2 ? 32 : 4)) / 8;
+        if (shape == Shape::clusters) return 4 * static_cast<float>(random.uniform(i % 7, d)) + x * 1e-3f;
+        if (shape == Shape::walk) return 2 + 2 * std::sin(0.01f * static_cast<float>(i * (d + 1))) + x * 0.02f;
+        return shape == Shape::line && d == 0 ? static_cast<float>(i) * 0.01f : 1.0f;
+    };
+    std::vector<float> state;
+    for (uint32_t d = 0; d < static_cast<uint32_t>(dim); ++d) state.push_back(coordinate(d));
     return state;
 }
 
@@ -641,7 +627,7 @@ TEST(the_tree_survives_any_order_of_coming_and_going) {
 }
 
 TEST(many_equal_points_neither_break_nor_slow_the_tree) {
-    // 50,000 states that differ only in a coordinate the projection is made not to see; 50,000 more evict all but 10,000.
+    // 50,000 states that differ only in a coordinate the projection does not see; 50,000 more evict all but 10,000.
     EpisodicMemory memory(
         {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 60000, .K = 2, .epsilon = 1}, 1);
     memory.projection = {1, 0, 0, 0, 1, 0};
@@ -823,20 +809,18 @@ TEST(a_damaged_memory_is_refused) {
     ToyArchive good;
     visit_memory(good, memory, 0);
     good.loading = true;
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.e"].resize(16);
-                visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.e"][7] = 0x7F;
-                bad.fields["memory.e"][6] = 0xF0; visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.keys"] = std::vector<unsigned char>(48);
-                visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.age"][0] = 2;
-                visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.age"][0] = 9;
-                visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.priority"][0] = 0;
-                visit_memory(bad, memory, 0));
-    CHECK_FAILS("checkpoint.entry", ToyArchive bad = good; bad.fields["memory.projection"].resize(8);
-                visit_memory(bad, memory, 0));
+    const auto check_refused = [&](const char* field, const auto& damage) {
+        ToyArchive bad = good;
+        damage(bad.fields[field]);
+        CHECK_FAILS("checkpoint.entry", visit_memory(bad, memory, 0));
+    };
+    check_refused("memory.e", [](auto& bytes) { bytes.resize(16); });
+    check_refused("memory.e", [](auto& bytes) { bytes[6] = 0xF0, bytes[7] = 0x7F; });  // infinity
+    check_refused("memory.keys", [](auto& bytes) { bytes.assign(48, 0); });
+    check_refused("memory.age", [](auto& bytes) { bytes[0] = 2; });
+    check_refused("memory.age", [](auto& bytes) { bytes[0] = 9; });
+    check_refused("memory.priority", [](auto& bytes) { bytes[0] = 0; });
+    check_refused("memory.projection", [](auto& bytes) { bytes.resize(8); });
     visit_memory(good, memory, 4);
     for (const int moves : {1, 3}) CHECK_FAILS("checkpoint.entry", visit_memory(good, memory, moves));
     memory.config.capacity = 2;

@@ -1,5 +1,6 @@
-// test_waypoints.cpp: the planner against breadth-first search and a closed form, the controller against numbers worked
-// out by hand, the data set against its definition, mechanics, and what is published of D4RL's.
+// test_waypoints.cpp: the planner against breadth-first search and D4RL's value iteration, that against a closed form,
+// the controller against numbers worked out by hand, the data set against its definition, mechanics, and what is
+// published of D4RL's.
 #include <deque>
 #include <map>
 
@@ -52,15 +53,51 @@ void for_every_target(Check&& check) {
         for (size_t i = 0; i < lines.size(); ++i) {
             for (size_t j = 0; j < lines[0].size(); ++j) {
                 if (lines[i][j] == '1') continue;
-                check(grid, lines, grid.number({static_cast<int>(i), static_cast<int>(j)}), distances(lines, i, j));
+                check(grid, lines, MazeCell{static_cast<int>(i), static_cast<int>(j)}, distances(lines, i, j));
                 ++targets;
             }
         }
-        CHECK_EQUAL(grid.open.size(), targets);
+        CHECK_EQUAL(grid.cells("0G").size(), targets);
     }
 }
-size_t row_of(const MazeGrid& grid, int cell) { return static_cast<size_t>(grid.cell(cell).row); }
-size_t column_of(const MazeGrid& grid, int cell) { return static_cast<size_t>(grid.cell(cell).column); }
+std::vector<MazeCell> all_cells(const MazeGrid& grid) { return grid.cells("01G"); }
+
+// D4RL's planner: exactly 50 sweeps of Q(s, a) <- R(s) + 0.99 max_b Q(s'(s, a), b) from Q = 0, with R = 1 in the target
+// and 0 elsewhere; a move into a wall or off the map stays in its cell. After k sweeps V_k = (1 - 0.99^k) / 0.01 in the
+// target (by staying), and 0.99^d V_(k-d) d moves away: less with every move, so a greedy path of up to 49 moves is a
+// shortest one. Cells of equal distance have equal values.
+constexpr std::array<MazeCell, 5> maze_moves{{{0, 0}, {0, -1}, {0, 1}, {-1, 0}, {1, 0}}};  // the order decides ties
+using MazeValues = std::vector<std::array<double, maze_moves.size()>>;                     // Q [cell][move]
+
+MazeCell after_move(const MazeGrid& grid, MazeCell cell, size_t move) {
+    const MazeCell to{cell.row + maze_moves[move].row, cell.column + maze_moves[move].column};
+    return grid.can_enter(to) ? to : cell;
+}
+
+MazeValues maze_values(const MazeGrid& grid, MazeCell target) {
+    const std::vector<MazeCell> cells = all_cells(grid);
+    MazeValues q(cells.size());
+    std::vector<double> v(q.size());  // max_b Q(s, b) of the sweep before
+    for (int sweep = 0; sweep < 50; ++sweep) {
+        for (size_t s = 0; s < q.size(); ++s) v[s] = std::ranges::max(q[s]);
+        for (const MazeCell cell : cells)
+            for (size_t move = 0; move < maze_moves.size(); ++move)
+                q[grid.number(cell)][move] = (grid.number(cell) == grid.number(target) ? 1.0 : 0.0) +
+                                             0.99 * v[grid.number(after_move(grid, cell, move))];
+    }
+    return q;
+}
+
+// The numbers of the cells after each greedy move (ties: the lowest move), up to the target or a hundred.
+std::vector<size_t> greedy_path(const MazeGrid& grid, const MazeValues& q, MazeCell cell, MazeCell target) {
+    std::vector<size_t> path;
+    do {
+        const auto& values = q[grid.number(cell)];
+        cell = after_move(grid, cell, static_cast<size_t>(std::ranges::max_element(values) - values.begin()));
+        path.push_back(grid.number(cell));
+    } while (path.back() != grid.number(target) && path.size() < 100);
+    return path;
+}
 
 WaypointController umaze_controller() {
     return {maze2d_grid(task_of("maze2d-umaze")), Random{test_seed(), Stream::data_set}};
@@ -71,31 +108,35 @@ WaypointController umaze_controller() {
 // ----- planner -----
 
 TEST(greedy_plans_are_shortest_paths_between_all_cells) {
-    for_every_target([](const MazeGrid& grid, const Lines& lines, int target, const auto& steps) {
+    for_every_target([](const MazeGrid& grid, const Lines& lines, MazeCell target, const auto& steps) {
         const MazeValues q = maze_values(grid, target);
-        for (int start = 0; start < grid.rows * grid.columns; ++start) {
-            const int distance = steps[row_of(grid, start)][column_of(grid, start)];
-            const std::vector<int> path = greedy_path(grid, q, start, target);
+        const MazePlan plan(grid, target);
+        for (const MazeCell start : all_cells(grid)) {
+            const size_t row = static_cast<size_t>(start.row), column = static_cast<size_t>(start.column);
+            const int distance = steps[row][column];
+            const std::vector<MazeCell> path = plan.path(start);
+            std::vector<size_t> numbers;
+            for (const MazeCell cell : path) numbers.push_back(grid.number(cell));
+            CHECK(numbers == greedy_path(grid, q, start, target));
             if (distance < 0) {  // deep in a wall, where a ball can get only by leaning on a corner
-                CHECK(lines[row_of(grid, start)][column_of(grid, start)] == '1');
-                CHECK(path == std::vector<int>(100, start));
+                CHECK(lines[row][column] == '1');
+                CHECK(numbers == std::vector<size_t>(100, grid.number(start)));
                 continue;
             }
             CHECK_EQUAL(static_cast<int>(path.size()), std::max(distance, 1));
-            CHECK_EQUAL(path.back(), target);
+            CHECK_EQUAL(numbers.back(), grid.number(target));
             // Of the moves that come nearer the first one in the order -column, +column, -row, +row.
-            int at = start;
-            for (const int next : path) {
-                if (at == target) break;
-                const size_t i = row_of(grid, at), j = column_of(grid, at);
+            size_t i = row, j = column;
+            for (const MazeCell next : path) {
+                if (steps[i][j] == 0) break;
                 const std::pair<size_t, size_t> order[] = {{i, j - 1}, {i, j + 1}, {i - 1, j}, {i + 1, j}};
                 for (const auto& [a, b] : order) {
                     if (a >= lines.size() || b >= lines[0].size() || lines[a][b] == '1') continue;
                     if (steps[a][b] != steps[i][j] - 1) continue;
-                    CHECK_EQUAL(next, grid.number({static_cast<int>(a), static_cast<int>(b)}));
+                    CHECK(next.row == static_cast<int>(a) && next.column == static_cast<int>(b));
                     break;
                 }
-                at = next;
+                i = static_cast<size_t>(next.row), j = static_cast<size_t>(next.column);
             }
         }
     });
@@ -109,18 +150,19 @@ TEST(values_after_fifty_sweeps_have_their_closed_form) {
                                                  : (std::pow(0.99, distance) - std::pow(0.99, sweeps)) / (1 - 0.99);
     };
     int farthest = 0;
-    for_every_target([&](const MazeGrid& grid, const Lines& lines, int target, const auto& steps) {
+    for_every_target([&](const MazeGrid& grid, const Lines& lines, MazeCell target, const auto& steps) {
         const MazeValues q = maze_values(grid, target);
-        for (int cell = 0; cell < grid.rows * grid.columns; ++cell) {
-            const size_t i = row_of(grid, cell), j = column_of(grid, cell);
-            const auto& values = q[static_cast<size_t>(cell)];
+        for (const MazeCell cell : all_cells(grid)) {
+            const size_t i = static_cast<size_t>(cell.row), j = static_cast<size_t>(cell.column);
+            const auto& values = q[grid.number(cell)];
             CHECK_CLOSE(*std::max_element(values.begin(), values.end()), closed_form(steps[i][j], 50), 1e-12);
             const std::pair<size_t, size_t> order[] = {{i, j}, {i, j - 1}, {i, j + 1}, {i - 1, j}, {i + 1, j}};
             for (size_t move = 0; move < 5; ++move) {
                 const auto [a, b] = order[move];
                 const bool enters = a < lines.size() && b < lines[0].size() && lines[a][b] != '1';
                 const int distance = enters ? steps[a][b] : steps[i][j];
-                CHECK_CLOSE(values[move], (cell == target) + 0.99 * closed_form(distance, 49), 1e-12);
+                const bool arrived = grid.number(cell) == grid.number(target);
+                CHECK_CLOSE(values[move], arrived + 0.99 * closed_form(distance, 49), 1e-12);
             }
             farthest = std::max(farthest, steps[i][j]);
         }
@@ -133,10 +175,10 @@ TEST(values_after_fifty_sweeps_have_their_closed_form) {
 TEST(positions_are_rounded_to_cells_halves_to_the_even_one) {
     const WaypointController controller = umaze_controller();
     const auto cell = [&](double x, double y) { return controller.grid.number(controller.cell_of({x, y})); };
-    CHECK_EQUAL(cell(0.5, 1.5), 0 + 2 * 5);
-    CHECK_EQUAL(cell(2.5, 3.5), 2 + 4 * 5);
-    CHECK_EQUAL(cell(2.51, 1.49), 3 + 1 * 5);
-    CHECK_EQUAL(cell(-0.5, 0), 0);
+    CHECK_EQUAL(cell(0.5, 1.5), 0 * 5 + 2u);
+    CHECK_EQUAL(cell(2.5, 3.5), 2 * 5 + 4u);
+    CHECK_EQUAL(cell(2.51, 1.49), 3 * 5 + 1u);
+    CHECK_EQUAL(cell(-0.5, 0), 0u);
     for (const double off : {-0.51, 4.51, double(INFINITY), double(NAN)}) {
         CHECK_FAILS("waypoints.off_map", controller.cell_of({off, 1}));
         CHECK_FAILS("waypoints.off_map", controller.cell_of({1, off}));
