@@ -135,26 +135,36 @@ struct Episode {
     double total_reward = 0;     // of all steps so far, undiscounted
     bool over = false;           // by termination or by an error
     std::string error;           // the sentence of environment.unstable, else empty
-    std::exception_ptr thrown;   // any other error, on its way out of a worker thread
+    std::exception_ptr thrown;   // by step(), on its way out of a worker thread
 
-    // Takes one step of the environment, whose state this episode's is.
+    // Takes one step of the environment, whose state this episode's is. Throws nothing; the caller's thread then calls
+    // take_error().
     void step(Environment& environment, const float* action, int action_dim) {
-        trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
-        trajectory.actions.insert(trajectory.actions.end(), action, action + action_dim);
+        reward = 0;
         try {
+            trajectory.states.insert(trajectory.states.end(), state.begin(), state.end());
+            trajectory.actions.insert(trajectory.actions.end(), action, action + action_dim);
+            trajectory.rewards.push_back(0);
             const Step step = environment.step(action, state.data());
             reward = step.reward;
             over = trajectory.terminated = step.terminated;
-        } catch (const Error& failure) {
-            over = true;
-            reward = 0;
-            error = failure.what();
-            if (failure.id != "environment.unstable") thrown = std::current_exception();
         } catch (...) {
+            over = true;
             thrown = std::current_exception();
+            return;
         }
-        trajectory.rewards.push_back(static_cast<float>(reward));
+        trajectory.rewards.back() = static_cast<float>(reward);
         total_reward += reward;
+    }
+
+    // Notes that the simulation broke down in step(). Errors: any other that it met.
+    void take_error() {
+        try {
+            if (thrown) std::rethrow_exception(std::exchange(thrown, nullptr));
+        } catch (const Error& failure) {
+            if (failure.id != "environment.unstable") throw;
+            error = failure.what();
+        }
     }
 };
 
@@ -189,8 +199,7 @@ std::vector<Episode> play(std::span<Environment* const> environments, const Rand
             Environment& environment = *environments[running[i] - episodes.data()];
             running[i]->step(environment, &actions[i * spec.action_dim], spec.action_dim);
         });
-        for (const Episode* episode : running)
-            if (episode->thrown) std::rethrow_exception(episode->thrown);
+        for (Episode* episode : running) episode->take_error();
         std::erase_if(running, [](const Episode* episode) { return episode->over; });
     }
     return episodes;
@@ -684,15 +693,22 @@ struct EpisodicMemory {
     // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for
     // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. limit: reach(), the largest
     // distance of a neighbour. The K closest of those within epsilon are those within epsilon of the K closest.
-    // Sixteen walks take one step each in turn, so that the next node of a walk can come from memory while the others
-    // compute. The tests hold this to a scan of all entries.
-    EACH_TARGET Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped,
-                                       float limit) const {
+    // The tests hold this to a scan of all entries.
+    Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
         std::vector<Walk> walks;
-        for (size_t begun = 0; begun < n || !walks.empty();) {
-            for (; begun < n && walks.size() < 16; ++begun)
+        walks.reserve(std::min<size_t>(n, 16));
+        walk(at, skipped, limit, walks, found);
+        return found;
+    }
+
+    // Sixteen walks take one step each in turn, so that the next node of a walk can come from memory while the others
+    // compute. walks: empty, with room for them.
+    EACH_TARGET void walk(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit,
+                          std::vector<Walk>& walks, Neighbourhoods& found) const {
+        for (size_t begun = 0; begun < skipped.size() || !walks.empty();) {
+            for (; begun < skipped.size() && walks.size() < walks.capacity(); ++begun)
                 walks.push_back({begun, &at[begun * dim], skipped[begun], limit});
             for (size_t i = walks.size(); i-- > 0;) {
                 if (walks[i].step(tree, points(), found)) continue;
@@ -700,7 +716,6 @@ struct EpisodicMemory {
                 walks.pop_back();
             }
         }
-        return found;
     }
 
     // The largest float below epsilon: distances are floats, so q <= reach() says q < epsilon.

@@ -302,7 +302,8 @@ inline void apply_assignments(Settings& settings, const std::vector<std::string>
     }
 }
 
-// The settings of one run but for its seed, for the options that train and import share. Errors: usage.*, dataset.missing.
+// The settings of one run but for its seed, for the options that train and import share. Errors: usage.*,
+// dataset.missing.
 inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method) {
     Settings settings = default_settings(task, method, arguments["--preset"]);
     if (settings.task != "gridworld") {

@@ -26,8 +26,8 @@ inline std::string clock_text(double seconds) {
     return hours + text;
 }
 
-// Set by SIGINT, SIGTERM and SIGHUP: a long command then saves its state and ends. A signal handler can reach nothing but
-// a global variable; this is the only one.
+// Set by SIGINT, SIGTERM and SIGHUP: a long command then saves its state and ends. A signal handler can reach nothing
+// but a global variable; this is the only one.
 inline volatile std::sig_atomic_t stop_requested = 0;
 
 inline constexpr std::array stop_signals = {SIGINT, SIGTERM, SIGHUP};

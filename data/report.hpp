@@ -2,9 +2,9 @@
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
 // length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
 //
-// Reads what run_folder.hpp writes: settings, command (older folders have none), progress.csv, episodes.csv (without the
-// file `finished` these logs may be missing or incomplete); of mazes paths.csv, if it is there; of finished grid worlds
-// policy.csv and start_actions.csv.
+// Reads what run_folder.hpp writes: settings, command (older folders have none), progress.csv, episodes.csv (without
+// the file `finished` these logs may be missing or incomplete); of mazes paths.csv, if it is there; of finished grid
+// worlds policy.csv and start_actions.csv.
 // Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; runs are
 // averaged only if all their settings but the seed are equal, those of the data and the first weights included, and
 // other runs stand in rows of their own, whose labels name what differs; errors name file and line.

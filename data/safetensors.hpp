@@ -413,8 +413,8 @@ struct TensorFile {
 //
 // Two metadata entries are this program's own. crc32.tensors: 8 hex digits for each tensor, in the order of the data.
 // crc32.header: the CRC-32 of bytes 0 to 8 + N, its own eight digits (bytes 41 to 48) taken as 00000000. A file with
-// neither was made elsewhere and is read unchecked, but for checkpoints, which are refused; otherwise both must hold, so
-// no single changed bit goes unnoticed.
+// neither was made elsewhere and is read unchecked, but for checkpoints, which are refused; otherwise both must hold,
+// so no single changed bit goes unnoticed.
 
 inline constexpr size_t header_limit = 100'000'000;  // bytes; the same as in the original implementation
 inline constexpr std::string_view header_start = "{\"__metadata__\":{\"crc32.header\":\"";

@@ -63,8 +63,8 @@ inline std::optional<double> to_number(const std::string& text) {
     return x;
 }
 
-// The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest number
-// in it; `name` begins the sentence.
+// The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest
+// number in it; `name` begins the sentence.
 inline double number_in(const std::string& text, const char* id, const char* name, auto low, auto high, bool whole) {
     const double least = static_cast<double>(low), most = static_cast<double>(high);
     const std::optional<double> x = to_number(text);
