@@ -892,8 +892,7 @@ void command_train(const Arguments& arguments) {
     }
 }
 
-// The network, the normaliser and the settings come from the model file; neither memory nor buffer is built. Without
-// --seed it is the run's last evaluation again, episode for episode.
+// From the model file alone; neither memory nor buffer is built. Without --seed: the run's last evaluation again.
 void command_eval(const Arguments& arguments) {
     const TensorFile file = open_model(arguments.words[0]);
     const Settings settings = evaluated_settings(arguments, settings_in(file));
@@ -956,10 +955,11 @@ void command_collect(const Arguments& arguments) {
             whole_number(arguments["--seed"], "--seed", 0, 2147483647), arguments["--policy"], thread_count(arguments));
 }
 
-// Without a task the list of tasks; with one its settings in preset paper.
+// Without a task the list of tasks; with one its settings.
 void command_tasks(const Arguments& arguments) {
     if (arguments.words.empty()) return print_tasks();
-    std::printf("%s", settings_text(default_settings(arguments.words[0], arguments["--method"], "paper")).c_str());
+    const Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
+    std::printf("%s", settings_text(settings).c_str());
 }
 
 // The verdict is the last thing printed.

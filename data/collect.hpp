@@ -431,8 +431,8 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
     if (!set && !walker) {
         std::vector<std::string> names = {walker_name};
         for (const PublishedDataSet& one : published_data_sets) names.push_back(one.id);
-        fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none; the nearest is %s", id.c_str(),
-             nearest_name(id, names).c_str());
+        fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none%s", id.c_str(),
+             nearest_hint(id, names).c_str());
     }
     if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);
     const std::string name = walker ? id + ".safetensors" : file_name(*set);

@@ -5,6 +5,9 @@
 // word, and exit status 2; other failures exit with 1.
 #pragma once
 
+#include <poll.h>
+#include <unistd.h>
+
 #include <csignal>
 #include <fstream>
 
@@ -24,7 +27,7 @@ struct Option {
 inline const Option option_table[] = {
     {"train import tasks", "--method", "NAME", "wodtem", "dt, odt or wodtem"},
     {"train", "--methods", "LIST", "", "several methods, separated by commas, one after the other"},
-    {"train import sweep", "--preset", "NAME", "small",
+    {"train import sweep tasks", "--preset", "NAME", "small",
      "paper: Tables I and II as printed; small: less of it; reduced: all of Table II but the network"},
     {"train", "--seed", "N", "0", "seed of everything but the data set"},
     {"train", "--seeds", "A-B", "", "several seeds, one after the other"},
@@ -102,12 +105,18 @@ inline Arguments parse_arguments(const Command& command, const std::vector<std::
         }
         if (taken.empty())
             fail("usage.option", "wodtem %s has no options; \"%s\" was given", command.name, words[i].c_str());
-        const Option& option =
-            row_named(taken, words[i], "usage.option",
-                      std::string("wodtem ") + command.name + " has no option \"%s\"; the nearest is %s");
-        if (option.value && (i + 1 == words.size() || words[i + 1].starts_with("--")))
+        // Two words, or one: --name=value.
+        const size_t equals = words[i].starts_with("--") ? words[i].find('=') : std::string::npos;
+        const Option& option = row_named(
+            taken, words[i].substr(0, equals), "usage.option",
+            std::string("wodtem ") + command.name + " has no option \"%s\"%s (wodtem " + command.name + " --help)" +
+                (arguments.options.contains("--set") ? "; a setting is given by --set, as --set learning_rate=1e-3"
+                                                     : ""));
+        const bool in_one = equals != std::string::npos;
+        if (in_one && !option.value) fail("usage.option", "option %s takes no value", option.name);
+        if (option.value && !in_one && (i + 1 == words.size() || words[i + 1].starts_with("--")))
             fail("usage.option", "option %s needs a value: %s", option.name, option.value);
-        const std::string value = option.value ? words[++i] : "yes";
+        const std::string value = !option.value ? "yes" : in_one ? words[i].substr(equals + 1) : words[++i];
         if (value.empty())
             fail("usage.option", "option %s needs a value that is not empty: %s", option.name, option.value);
         const bool is_set = std::string_view(option.name) == "--set";  // which, as a switch, may be repeated
@@ -131,6 +140,12 @@ inline void print_command_list(std::span<const Command> commands) {
     std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
 }
 
+// Which files this program reads and writes, and with what it was built.
+inline void print_version() {
+    std::printf("wodtem: %s, %s; MuJoCo %s; compiler %s\n", model_format, checkpoint_format, mujoco_version().c_str(),
+                __VERSION__);
+}
+
 inline void print_help(const Command& command) {
     std::printf("wodtem %s %s\n%s\n\n", command.name, command.words, command.meaning);
     for (const Option& option : options_of(command)) {
@@ -146,19 +161,25 @@ inline int run_command_line(std::span<const Command> commands, const std::vector
     const auto asks_for_help = [](const std::string& word) {
         return word == "--help" || word == "-h" || word == "help";
     };
-    if (words.empty() || asks_for_help(words[0])) {
+    if (words.empty() || (asks_for_help(words[0]) && words.size() == 1)) {
         print_command_list(commands);
+    } else if (words[0] == "--version") {
+        print_version();
     } else {
-        const Command& command = row_named(commands, words[0], "usage.command",
-                                           "unknown command \"%s\"; the nearest is %s (wodtem --help lists all)");
-        const std::vector<std::string> rest(words.begin() + 1, words.end());
+        std::vector<std::string> rest = words;
+        if (asks_for_help(words[0])) std::swap(rest[0], rest[1]);  // help train
+        const Command& command =
+            row_named(commands, rest[0], "usage.command", "unknown command \"%s\"%s (wodtem --help lists all)");
+        rest.erase(rest.begin());
         if (std::any_of(rest.begin(), rest.end(), asks_for_help))
             print_help(command);
         else
             command.run(parse_arguments(command, rest));
     }
-    if (std::fflush(stdout) != 0 || std::ferror(stdout))
-        fail("console.write", "cannot write the results to stdout: is the disk full?");
+    const bool failed = std::fflush(stdout) != 0 || std::ferror(stdout);
+    pollfd output = {STDOUT_FILENO, POLLOUT, 0};
+    const bool reader_left = poll(&output, 1, 0) > 0 && (output.revents & POLLERR) != 0;  // as `head`: no failure
+    if (failed && !reader_left) fail("console.write", "cannot write the results to stdout: is the disk full?");
     return words.empty() ? 2 : 0;
 }
 
@@ -285,17 +306,19 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
     settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
 }
 
+// Settings that options or what they name decide.
+constexpr const char* not_for_set[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
+                                       "mujoco", "dataset", "dataset_sha256", "first_weights"};
+
 // NAME=VALUE of each --set. Errors: usage.setting.
 inline void apply_assignments(Settings& settings, const std::vector<std::string>& assignments) {
-    constexpr const char* fixed[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
-                                     "mujoco", "dataset", "dataset_sha256", "first_weights"};
     std::set<std::string> seen;
     for (const std::string& assignment : assignments) {
         const size_t equals = assignment.find('=');
         if (equals == std::string::npos)
             fail("usage.setting", "--set needs NAME=VALUE, not \"%s\"", assignment.c_str());
         const std::string name = setting_row(assignment.substr(0, equals)).name;
-        if (contains(fixed, name))
+        if (contains(not_for_set, name))
             fail("usage.setting", "%s is not given by --set; see wodtem train --help", name.c_str());
         if (!seen.insert(name).second) fail("usage.setting", "setting %s is given twice", name.c_str());
         set_from(settings, name, assignment.substr(equals + 1), "command line");
@@ -421,12 +444,14 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
 
 // The help of train: every setting.
 inline std::string settings_help() {
-    std::string text = "\nSettings for --set, with the values of preset paper:\n";
-    const Settings settings;
+    std::string text =
+        "\nSettings for --set, with the grid world's values in preset small (others: wodtem tasks TASK --preset NAME):\n";
+    const Settings settings = default_settings("gridworld", "wodtem", "small");
     for (const SettingRow& row : setting_rows) {
+        if (contains(not_for_set, row.name)) continue;
         char line[300];
         std::snprintf(line, sizeof line, "  %-24s %-12s %s\n", row.name, setting_text(settings, row).c_str(),
-                      row.source);
+                      source_of(settings, row).c_str());
         text += line;
     }
     return text;

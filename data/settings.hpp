@@ -105,13 +105,25 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
     return std::ranges::min(names, {}, [&](const std::string& other) { return edit_distance(name, other); });
 }
 
-// The row of a table that has this name. `sentence` is a format of two texts: the name, and the nearest one.
+// '; the nearest is "NAME"' for the end of a sentence; nothing where none of the names is near: where more than half of
+// the letters would have to change, and neither is a part of the other.
+inline std::string nearest_hint(const std::string& name, const std::vector<std::string>& names) {
+    const std::string nearest = nearest_name(name, names);
+    const bool part = nearest.find(name) != std::string::npos || name.find(nearest) != std::string::npos;
+    const size_t longer = std::max(name.size(), nearest.size());
+    const bool near = part || 2 * static_cast<size_t>(edit_distance(name, nearest)) <= longer;
+    return near ? "; the nearest is \"" + nearest + "\"" : "";
+}
+
+// The row of a table that has this name. `sentence` is a format of two texts: the name, and the hint to the nearest.
 // Errors: `id`, if there is none.
 inline const auto& row_named(const auto& rows, const std::string& name, const char* id, const std::string& sentence) {
-    const auto distance = [&](const auto& row) { return edit_distance(name, row.name); };
-    const auto& nearest = *std::ranges::min_element(rows, {}, distance);
-    if (name != nearest.name) fail(id, sentence.c_str(), name.c_str(), nearest.name);
-    return nearest;
+    std::vector<std::string> names;
+    for (const auto& row : rows) {
+        if (name == row.name) return row;
+        names.push_back(row.name);
+    }
+    fail(id, sentence.c_str(), name.c_str(), nearest_hint(name, names).c_str());
 }
 
 // The index of `name` among an enumeration's names, which hold it.
@@ -330,7 +342,7 @@ inline const TaskRow reduced_rows[] = {
 
 // Errors: usage.setting names the nearest setting.
 inline const SettingRow& setting_row(const std::string& name) {
-    return row_named(setting_rows, name, "usage.setting", "unknown setting \"%s\"; the nearest is \"%s\"");
+    return row_named(setting_rows, name, "usage.setting", "unknown setting \"%s\"%s");
 }
 
 inline std::string setting_text(const Settings& settings, const SettingRow& row) {
@@ -342,8 +354,8 @@ inline std::string setting_text(const Settings& settings, const SettingRow& row)
 inline void parse_value(const SettingRow& row, const std::string& text, std::string& value) {
     const std::vector<std::string> choices = split(row.choices, '|');
     if (*row.choices != 0 && !contains(choices, text))
-        fail("usage.setting", "%s cannot be \"%s\"; it is one of %s; the nearest is \"%s\"", row.name, text.c_str(),
-             row.choices, nearest_name(text, choices).c_str());
+        fail("usage.setting", "%s cannot be \"%s\"; it is one of %s%s", row.name, text.c_str(), row.choices,
+             nearest_hint(text, choices).c_str());
     value = text;
 }
 

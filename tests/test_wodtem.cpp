@@ -1902,9 +1902,20 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem", 2, "wodtem COMMAND --help");
     check_shell("./wodtem --help", 0, "report");
     check_shell("./wodtem train --help", 0, "updates_per_iteration");
-    check_shell("./wodtem trian gridworld", 2, "nearest is train");
+    check_shell("./wodtem help train", 0, "updates_per_iteration");
+    check_shell("./wodtem train --help", 0, "width                    8 ");  // the value that would be used
+    check_shell("./wodtem tasks gridworld --preset=paper", 0, "width = 512");
+    check_shell("./wodtem --version", 0, "wodtem model 1, wodtem checkpoint 1; MuJoCo");
+    check_shell("./wodtem train gridworld --lr 0.1", 2,
+                "has no option \"--lr\" (wodtem train --help); a setting is given");
+    check_shell("./wodtem reprot", 2, "the nearest is \"report\"");
+    check_shell("./wodtem jump", 2, "unknown command \"jump\" (wodtem --help lists all)");
+    check_shell("./wodtem sweep --estimate=yes", 2, "takes no value");
+    // A reader that has seen enough is no failure; a full disk is one (below).
+    check_shell("({ ./wodtem sweep --seeds 0-9999; echo status $? >&2; } | head -1)", 0, "status 0");
+    check_shell("./wodtem trian gridworld", 2, "nearest is \"train\"");
     check_shell("./wodtem train gridwrold", 2, "nearest is \"gridworld\"");
-    check_shell("./wodtem train gridworld --metod odt", 2, "nearest is --method");
+    check_shell("./wodtem train gridworld --metod odt", 2, "nearest is \"--method\"");
     check_shell("./wodtem train gridworld --method odd", 2, "nearest is \"odt\"");
     check_shell("./wodtem train gridworld --seed -1", 2, "nearest is 0");
     check_shell("./wodtem train gridworld --seed 1 --seed 2", 2, "given twice");
@@ -1917,7 +1928,7 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem train gridworld --physics 2.2", 2, "cannot have physics");
     check_shell("./wodtem train hopper --dataset random --set behaviour=left_down", 2, "it is recorded or random");
     check_shell("./wodtem trace gridworld", 2, "MuJoCo");
-    check_shell("./wodtem trace nothing", 2, "nearest is");
+    check_shell("./wodtem trace nothing", 2, "\"nothing\"");
     check_shell("./wodtem trace hopper --physics old", 2, "none|d4rl|2.2");
     check_shell("./wodtem train gridworld --set alpha=2", 2, "nearest is 1");
     check_shell("./wodtem train gridworld --set alhpa=1", 2, "nearest is \"alpha\"");
