@@ -122,18 +122,19 @@ struct Run {
     size_t method = 0;                   // in `methods`
     const MujocoTask* mujoco = nullptr;  // null: the grid world
     bool finished = false;
-    double so_far = 0;                                       // online interactions
-    std::vector<double> interactions, length, total, score;  // of each evaluation; total: the return
-    std::vector<double> episode_length, episode_return;      // of each online episode
-    std::vector<MoveShares> policy;                          // [36], or empty
-    std::array<std::vector<double>, 3> start_actions;        // learned, D_offline, D_online: [8] each, or empty
-    std::vector<MazeEpisode> paths;                          // of the latest evaluation in a maze, or empty
+    double so_far = 0;                                          // online interactions
+    std::vector<double> interactions, length, total, score;     // of each evaluation; total: the return
+    std::vector<double> advice, advice_distance, advice_shift;  // the dose before each evaluation; empty: not logged
+    std::vector<double> episode_length, episode_return;         // of each online episode
+    std::vector<MoveShares> policy;                             // [36], or empty
+    std::array<std::vector<double>, 3> start_actions;           // learned, D_offline, D_online: [8] each, or empty
+    std::vector<MazeEpisode> paths;                             // of the latest evaluation in a maze, or empty
 
     const Method& about_method() const { return methods[method]; }
     bool offline_only() const { return method == 0; }
 };
 using Runs = std::vector<const Run*>;              // of one row unless said otherwise, by seed; never empty
-using Quantity = std::vector<double> Run::*;       // length, total or score
+using Quantity = std::vector<double> Run::*;       // length, total or score; of the dose
 using Summary = double (*)(const Run&, Quantity);  // final_value or last_ten
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
@@ -214,6 +215,11 @@ inline Run read_run(const std::string& folder) {
         run.length = log.results("eval_length");
         run.total = log.results("eval_return");
         run.score = log.results("eval_score");
+        if (run.settings.method == "wodtem" && contains(log.table.header, "advice")) {
+            run.advice = log.results("advice");
+            run.advice_distance = log.results("advice_distance");
+            run.advice_shift = log.results("advice_shift");
+        }
         if (!run.interactions.empty()) run.so_far = run.interactions.back();
     }
     if (!run.offline_only() && (run.finished || exists("episodes.csv"))) {
@@ -700,6 +706,23 @@ inline Table method_table(const Group& group) {
     return table;
 }
 
+// What the memory changes of the loss, as progress.csv has it: mean of the last ten rows, in thousandths, over seeds.
+inline Table dose_table(const Group& group) {
+    Table table{{"The memory's dose, in thousandths", "Share of the loss", "Moves actions by", "Mean move"}, {}};
+    for (const Row& row : group.rows) {
+        const auto thousandths = [&](Quantity quantity) {
+            Spread spread = spread_of(row.runs, last_ten, quantity);
+            spread.mean *= 1000;
+            spread.deviation *= 1000;
+            return plus_minus(spread);
+        };
+        if (!row.any().advice.empty())
+            table.rows.push_back({row.label(), thousandths(&Run::advice), thousandths(&Run::advice_distance),
+                                  thousandths(&Run::advice_shift)});
+    }
+    return table;
+}
+
 // One row for each run: how far it came, its own results, and where it lies.
 inline Table run_table(const Group& group) {
     const bool grid = !group.any().mujoco;
@@ -784,6 +807,13 @@ inline Section make_section(const Runs& runs) {
     name_differences(group);
     Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
     if (!group.in_all.rows.empty()) section.parts.emplace_back(group.in_all);
+    if (const Table doses = dose_table(group); !doses.rows.empty()) {
+        section.parts.emplace_back(
+            "The dose: 1 - w is the share of the loss that is the memory's advice, a-hat in the place of a. It moves "
+            "what the policy is fitted to by (1 - w) (a-hat - a) at a step, on the grid world by that much probability: "
+            "the mean length of these moves, and the length of the mean move, in which moves to and fro cancel.");
+        section.parts.emplace_back(doses);
+    }
     (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);
     section.parts.emplace_back(command_table(group));
     return section;

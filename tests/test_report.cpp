@@ -386,6 +386,29 @@ TEST(scores_are_compared_with_table_three) {
     CHECK_CONTAINS(text, "| WODTEM | 1 | 50.00 ± - | 25.50 ± - | - |");
 }
 
+// Two seeds whose last rows are 20, 30 and -- shares; the third run's progress.csv is of an older program.
+TEST(the_dose_is_shown_in_thousandths_where_it_was_logged) {
+    const TemporaryFolder scratch;
+    const auto add_run = [&](int seed, const std::string& dose) {
+        const std::string folder = write_run(scratch.path, "wodtem", seed, {{0, 6}});
+        write(
+            folder, "progress.csv",
+            "interactions,eval_length,eval_return,eval_score,advice,advice_distance,advice_shift\n0,6,1,1,nan,nan,nan\n"
+            "9,6,1,1," +
+                dose + "\n");
+        return folder;
+    };
+    const std::vector<std::string> folders = {add_run(0, "0.02,0.01,0.0005"), add_run(1, "0.03,0.01,0.0015"),
+                                              write_run(scratch.path, "wodtem", 2, {{0, 6}, {9, 6}}),
+                                              write_run(scratch.path, "odt", 0, {{0, 6}, {9, 6}})};
+    report(folders, scratch.path + "/report");
+    const std::string page = read_file(scratch.path + "/report/report.md");
+    CHECK(narrow(page).find("| WODTEM | 25.00 ± 7.07 | 10.00 ± 0.00 | 1.00 ± 0.71 |") != std::string::npos);
+    CHECK(page.find("| ODT | 25") == std::string::npos);
+    report({folders[3]}, scratch.path + "/report");
+    CHECK(read_file(scratch.path + "/report/report.md").find("dose") == std::string::npos);
+}
+
 TEST(report_of_a_run_that_has_just_begun_has_dashes) {
     const TemporaryFolder temporary;
     write(temporary.path + "/run", "settings", settings_file("gridworld", "odt", 3, {{"preset", "small"}}));
