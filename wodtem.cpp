@@ -902,9 +902,10 @@ void command_eval(const Arguments& arguments) {
     Compute compute(kernel_of(arguments), thread_count(arguments));
     Tape<float> acting(compute);
     acting.recording = false;
-    const Environments environments(*make_environment(settings), settings.eval_episodes);
     const uint64_t number = arguments.has("--seed") ? 0 : std::max<uint64_t>(1, contents.evaluations) - 1;
+    const Environments environments(*make_environment(settings), settings.eval_episodes);
     const Evaluation evaluation = evaluate(agent, acting, environments.all(), number);
+    if (arguments.has("--record")) write_episodes(arguments["--record"], agent.spec, evaluation.episodes, file.path);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
 }
 
@@ -924,8 +925,7 @@ void command_import(const Arguments& arguments) {
     });
 }
 
-// Seconds that a run would take on this machine: the time of an update, averaged over three after a first one that
-// allocates, times the number of updates to expect.
+// Seconds that a run takes here: the mean time of three updates, after one that allocates, times all updates expected.
 double estimated_seconds(Settings settings, const Kernel& kernel) {
     if (settings.task != "gridworld") settings.behaviour = "random";
     Compute compute(kernel, default_threads(settings));

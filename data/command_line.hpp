@@ -43,6 +43,7 @@ inline const Option option_table[] = {
     {"eval", "--episodes", "N", "", "episodes (default: as many as the run's evaluations have)"},
     {"eval", "--seed", "N", "", "of the starts (default: the starts of the run's last evaluation)"},
     {"eval", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
+    {"eval", "--record", "FILE", "", "write the episodes there, as a data set in D4RL's layout"},
     {"export", "--odt", nullptr, "",
      "for load_state_dict(strict=True) of ODT's own code: its names, its unused tensors"},
     {"import", "--task", "ID", "", "whose network it is; not needed if `wodtem export` made the file"},

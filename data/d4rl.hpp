@@ -365,6 +365,34 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
     return trajectories;
 }
 
+// Writes episodes as a data set in D4RL's layout, for `info`, `train --dataset` and others: raw states, actions (a move
+// as its number), rewards, and the last row of each episode marked. Those whose simulation broke down are left out.
+// Errors: file.input if `path` is `input`, dataset.empty, file.write.
+inline void write_episodes(const std::string& path, const EnvironmentSpec& spec, const std::vector<Episode>& episodes,
+                           const std::string& input) {
+    std::vector<float> observations, actions, rewards;
+    std::vector<uint8_t> terminals, timeouts;
+    const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
+    for (const Episode& episode : episodes) {
+        if (!episode.error.empty()) continue;
+        append(observations, episode.trajectory.states);
+        append(actions, episode.trajectory.actions);
+        append(rewards, episode.trajectory.rewards);
+        for (std::vector<uint8_t>* flags : {&terminals, &timeouts}) flags->resize(rewards.size());
+        (episode.trajectory.terminated ? terminals : timeouts).back() = 1;
+    }
+    require(!rewards.empty(), "dataset.empty", path, ": there is no episode to write");
+    require_other_file(path, input);
+    const uint64_t rows = rewards.size(), S = static_cast<uint64_t>(spec.state_dim);
+    Hdf5Writer file(path);
+    file.add("observations", {rows, S}, observations);
+    file.add("actions", {rows, static_cast<uint64_t>(spec.action_dim)}, actions);
+    file.add("rewards", {rows}, rewards);
+    file.add("terminals", {rows}, terminals);
+    file.add("timeouts", {rows}, timeouts);
+    file.close();
+}
+
 // The offline data of a run with their returns: the grid world's behaviour policy, a file, or uniformly random actions.
 inline std::vector<Trajectory> make_data_set(const Settings& settings) {
     std::vector<Trajectory> trajectories;

@@ -1049,6 +1049,14 @@ TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
     check_shell(eval, 0, "episode 1: length " + last_row()[12] + ", return " + last_row()[13] + " ");
     check_shell(eval + " --seed 5 --episodes 3 --set g_eval=0.5 --set eval_context=1", 0, "seed 5: mean length");
     check_shell(eval + " --episodes 3", 0, "over 3 episodes");
+    check_shell(eval + " --episodes 3 --record " + scratch / "made.hdf5", 0, "over 3 episodes");
+    const Rows rows = read_data_set(scratch / "made.hdf5");
+    CHECK_EQUAL(number_text(rows.count), number_text(3 * static_cast<int>(*to_number(last_row()[12]))));  // three alike
+    CHECK(rows.state_dim == 2 && rows.action_dim == 1 && rows.ends(rows.count - 1) && rows.ends(rows.count / 3 - 1));
+    CHECK_EQUAL(std::count(rows.terminals.begin(), rows.terminals.end(), 1) +
+                    std::count(rows.timeouts.begin(), rows.timeouts.end(), 1),
+                3);
+    check_shell(eval + " --record " + run + "/model.safetensors", 1, "that is read");
     check_shell(eval + " --set alpha=0.5", 2, "eval takes --set g_eval=X and --set eval_context=N");
     check_shell(eval + " --set g_eval=x", 2, "g_eval cannot be");
     check_shell(eval + " --seed -1", 2, "nearest is 0");
@@ -1534,8 +1542,9 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     settings.dataset = " my set # 2\n.hdf5";  // another name for the same data: the same run
     quiet_train(settings, scratch / "renamed", 2);
     const std::vector<std::string> last = results::Log(scratch / "renamed/progress.csv").table.rows.back();
-    check_shell("./wodtem eval " + scratch / "renamed", 0,
+    check_shell("./wodtem eval " + (scratch / "renamed") + " --record " + (scratch / "made.hdf5"), 0,
                 "mean length " + last[12] + ", mean return " + last[13] + " +-");
+    check_shell("./wodtem info " + (scratch / "made.hdf5") + " --task maze2d-umaze", 0, "trajectories: 3");
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
 
