@@ -446,7 +446,8 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
 // The help of train: every setting.
 inline std::string settings_help() {
     std::string text =
-        "\nSettings for --set, with the grid world's values in preset small (others: wodtem tasks TASK --preset NAME):\n";
+        "\nSettings for --set, with the grid world's values in preset small (for others: wodtem tasks TASK --preset "
+        "NAME):\n";
     const Settings settings = default_settings("gridworld", "wodtem", "small");
     for (const SettingRow& row : setting_rows) {
         if (contains(not_for_set, row.name)) continue;

@@ -810,8 +810,9 @@ inline Section make_section(const Runs& runs) {
     if (const Table doses = dose_table(group); !doses.rows.empty()) {
         section.parts.emplace_back(
             "The dose: 1 - w is the share of the loss that is the memory's advice, a-hat in the place of a. It moves "
-            "what the policy is fitted to by (1 - w) (a-hat - a) at a step, on the grid world by that much probability: "
-            "the mean length of these moves, and the length of the mean move, in which moves to and fro cancel.");
+            "what the policy is fitted to by (1 - w) (a-hat - a) at a step; on the grid world that much probability "
+            "moves. Here: the mean length of these moves, and the length of the mean move, in which moves to and fro "
+            "cancel.");
         section.parts.emplace_back(doses);
     }
     (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);

@@ -1,5 +1,5 @@
-// bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's peaks first, then
-// each kernel's share of them at the shapes that training uses, the update of both networks with the best
+// bench.hpp: what `wodtem bench` measures, all in one run, so that ratios mean something: the machine's peaks first,
+// then each kernel's share of them at the shapes that training uses, the update of both networks with the best
 // kernel, look-ups, acting. Medians and ranges; a machine's clock moves with its neighbours, so figures of different
 // runs do not compare.
 // Included by wodtem.cpp, after training. Leaves out: judging; a test never looks at a clock.
@@ -276,8 +276,8 @@ void bench_other_kernels(Measurements& measured, const Kernel& kernel, int threa
 }
 
 // Arithmetic of one update that the action prediction needs (2 a multiply-add; forward, and twice that backward), with
-// whole windows of C steps: 3C - 1 tokens in every layer but the last, which needs keys and values of all tokens and the
-// rest for the C state tokens; attention sees half of the tokens on average.
+// whole windows of C steps: 3C - 1 tokens in every layer but the last, which needs keys and values of all tokens and
+// the rest for the C state tokens; attention sees half of the tokens on average.
 double update_flops(const Settings& settings) {
     const double d = static_cast<double>(settings.width), C = static_cast<double>(settings.context_length);
     const double tokens = 3 * C - 1, whole_layer = tokens * (12 * d * d + tokens * d),
