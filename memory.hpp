@@ -135,7 +135,7 @@ struct Episode {
     double total_reward = 0;     // of all steps so far, undiscounted
     bool over = false;           // by termination or by an error
     std::string error;           // the sentence of environment.unstable, else empty
-    std::exception_ptr thrown;   // by step(), on its way out of a worker thread
+    std::exception_ptr thrown;   // what step() caught, for take_error() to throw in the caller's thread
 
     // Takes one step of the environment, whose state this episode's is. Throws nothing; the caller's thread then calls
     // take_error().
@@ -698,17 +698,18 @@ struct EpisodicMemory {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
         std::vector<Walk> walks;
-        walks.reserve(std::min<size_t>(n, 16));
-        walk(at, skipped, limit, walks, found);
+        walks.reserve(walks_side_by_side);
+        search_tree(at, skipped, limit, walks, found);
         return found;
     }
 
-    // Sixteen walks take one step each in turn, so that the next node of a walk can come from memory while the others
-    // compute. walks: empty, with room for them.
-    EACH_TARGET void walk(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit,
-                          std::vector<Walk>& walks, Neighbourhoods& found) const {
+    // Several walks take one step each in turn, so that the next node of a walk can come from memory while the others
+    // compute. walks: empty, with room for walks_side_by_side, so that push_back() allocates nothing.
+    static constexpr size_t walks_side_by_side = 16;
+    EACH_TARGET void search_tree(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit,
+                                 std::vector<Walk>& walks, Neighbourhoods& found) const {
         for (size_t begun = 0; begun < skipped.size() || !walks.empty();) {
-            for (; begun < skipped.size() && walks.size() < walks.capacity(); ++begun)
+            for (; begun < skipped.size() && walks.size() < walks_side_by_side; ++begun)
                 walks.push_back({begun, &at[begun * dim], skipped[begun], limit});
             for (size_t i = walks.size(); i-- > 0;) {
                 if (walks[i].step(tree, points(), found)) continue;

@@ -182,8 +182,9 @@ class Threads {
     int count() const { return static_cast<int>(workers_.size()) + 1; }
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
-    // f must not throw and must not call run(). So it allocates nothing: an exception that leaves it would end the
-    // process in a worker, and in the calling thread leave the workers with a job that is gone. Memory is had before.
+    // f must not call run() and must not throw: an exception that leaves it would end the process in a worker, and in
+    // the calling thread leave the workers with a job that is gone. What may throw, an allocation say, is done before
+    // run(), or caught inside f.
     // `serial`: the calling thread runs all tasks alone.
     // Errors: nn.stopped, as soon as asked_to_stop() says yes; the tasks that no thread has begun are then left out.
     template <class F>
@@ -292,8 +293,8 @@ N divide_up(N n, std::type_identity_t<N> by) {
 // order of additions is written out, so all versions give the same bits.
 
 // For functions that stand by themselves: the compiler makes the versions, and chooses when the program starts. (The
-// sanitizers cannot start with it.) No exception may leave such a function: with GCC 12 it ends the process, whoever
-// would catch it. So these functions allocate nothing either.
+// sanitizers cannot start with it.) No exception may leave such a function: with GCC 12 it ends the process even if
+// a caller has a handler. What may throw, an allocation say, is done before.
 #if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
 #define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else

@@ -19,7 +19,6 @@
 #include <cstdint>
 #include <functional>
 #include <memory>
-#include <numeric>
 #include <span>
 #include <string>
 #include <vector>
@@ -28,7 +27,7 @@
 #include "memory.hpp"
 #include "mujoco_env.hpp"
 #include "nn.hpp"
-// No loop below this line takes time: it is compiled quickly.
+// What follows is compiled quickly, since no loop in it takes a noticeable share of an update.
 #pragma GCC optimize("O1")
 #include "data/collect.hpp"
 #include "data/command_line.hpp"
@@ -561,12 +560,12 @@ struct Evaluation {
     std::vector<Episode> episodes;
 };
 
-// Sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. number: of the evaluation in its run.
+// Sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. first: of the evaluations' episodes.
 Evaluation evaluate(const Agent& agent, Tape<float>& acting, std::span<Environment* const> environments,
-                    uint64_t number) {
+                    uint64_t first) {
     Evaluation result;
-    const uint64_t first = evaluation_episodes + number * environments.size();
-    result.episodes = rollout(agent, acting, environments, Act::most_likely, agent.settings.g_eval, first);
+    result.episodes =
+        rollout(agent, acting, environments, Act::most_likely, agent.settings.g_eval, evaluation_episodes + first);
     // Undiscounted returns, as D4RL's scores are defined; episodes whose simulation broke down do not count.
     double length = 0, total = 0, count = 0;
     for (const Episode& episode : result.episodes) {
@@ -627,7 +626,8 @@ ProgressRow progress_row(const Run& run) {
 // Evaluates the policy, reports the evaluation with the sums since the one before, and clears the sums.
 void evaluate_and_report(Run& run, const Observer& observer) {
     Progress& p = run.progress;
-    const Evaluation evaluation = evaluate(run.agent, run.acting, run.environments.all(), p.evaluations);
+    const uint64_t first = p.evaluations * static_cast<uint64_t>(run.agent.settings.eval_episodes);
+    const Evaluation evaluation = evaluate(run.agent, run.acting, run.environments.all(), first);
     count_dropped(run, observer, evaluation.episodes, "an evaluation");
     p.eval_length = evaluation.mean_length;
     p.eval_return = evaluation.mean_return;
@@ -832,7 +832,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     Run run(compute, settings, *make_environment(settings));
     const bool had_log = folder.has("progress.csv"), resumed = begin_or_continue(run, folder);
     drawing_and_reading.reset();
-    if (resumed || had_log) print_start(path, resumed, run.progress.updates);
+    if (resumed || had_log) print_continuation(path, resumed, run.progress.updates);
     if (!resumed) folder.begin_logs();
 
     // Each event of the run has its row in a log; rows come before the checkpoint that counts them.
@@ -894,19 +894,19 @@ void command_train(const Arguments& arguments) {
 
 // From the model file alone; neither memory nor buffer is built. Without --seed: the run's last evaluation again.
 void command_eval(const Arguments& arguments) {
-    const TensorFile file = open_model(arguments.words[0]);
-    const Settings settings = evaluated_settings(arguments, settings_in(file));
+    const TensorFile file = open_model_or_checkpoint(arguments.words[0]);
+    const Settings settings = evaluated_settings(arguments, file);
     Agent agent(settings, spec_of(settings));
     ModelContents contents = contents_of(agent);
     load_model(contents, file);
     Compute compute(kernel_of(arguments), thread_count(arguments));
     Tape<float> acting(compute);
     acting.recording = false;
-    const uint64_t number = arguments.has("--seed") ? 0 : std::max<uint64_t>(1, contents.evaluations) - 1;
+    const uint64_t first = arguments.has("--seed") ? 0 : first_of_last_evaluation(contents, settings_in(file));
     const Environments environments(*make_environment(settings), settings.eval_episodes);
-    const Evaluation evaluation = evaluate(agent, acting, environments.all(), number);
-    if (arguments.has("--record")) write_episodes(arguments["--record"], agent.spec, evaluation.episodes, file.path);
+    const Evaluation evaluation = evaluate(agent, acting, environments.all(), first);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
+    if (arguments.has("--record")) write_episodes(arguments["--record"], agent.spec, evaluation.episodes);
 }
 
 // From a model to ODT's code, and back.

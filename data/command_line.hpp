@@ -28,7 +28,7 @@ inline const Option option_table[] = {
     {"train import tasks", "--method", "NAME", "wodtem", "dt, odt or wodtem"},
     {"train", "--methods", "LIST", "", "several methods, separated by commas, one after the other"},
     {"train import sweep tasks", "--preset", "NAME", "small",
-     "paper: Tables I and II as printed; small: less of it; reduced: all of Table II but the network"},
+     "paper: Tables I and II as printed; small: less of it; reduced: Table II's schedule with a small network"},
     {"train", "--seed", "N", "0", "seed of everything but the data set"},
     {"train", "--seeds", "A-B", "", "several seeds, one after the other"},
     {"train import sweep", "--set", "NAME=VALUE", "", "any setting (see `wodtem tasks TASK`); may be repeated"},
@@ -120,7 +120,7 @@ inline Arguments parse_arguments(const Command& command, const std::vector<std::
         const std::string value = !option.value ? "yes" : in_one ? words[i].substr(equals + 1) : words[++i];
         if (value.empty())
             fail("usage.option", "option %s needs a value that is not empty: %s", option.name, option.value);
-        const bool is_set = std::string_view(option.name) == "--set";  // which, as a switch, may be repeated
+        const bool is_set = std::string_view(option.name) == "--set";  // it may be repeated, as switches may
         if (!arguments.given.insert(option.name).second && option.value && !is_set)
             fail("usage.option", "option %s is given twice", option.name);
         if (is_set) arguments.assignments.push_back(value);
@@ -164,7 +164,7 @@ inline int run_command_line(std::span<const Command> commands, const std::vector
     };
     if (words.empty() || (asks_for_help(words[0]) && words.size() == 1)) {
         print_command_list(commands);
-    } else if (words[0] == "--version") {
+    } else if (words[0] == "--version" && words.size() == 1) {
         print_version();
     } else {
         std::vector<std::string> rest = words;
@@ -308,8 +308,8 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
 }
 
 // Settings that options or what they name decide.
-constexpr const char* not_for_set[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
-                                       "mujoco", "dataset", "dataset_sha256", "first_weights"};
+constexpr std::string_view not_for_set[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
+                                            "mujoco", "dataset", "dataset_sha256", "first_weights"};
 
 // NAME=VALUE of each --set. Errors: usage.setting.
 inline void apply_assignments(Settings& settings, const std::vector<std::string>& assignments) {
@@ -344,7 +344,9 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
 }
 
 // The settings of a model with what `eval` was told to change. Errors: usage.*.
-inline Settings evaluated_settings(const Arguments& arguments, Settings settings) {
+inline Settings evaluated_settings(const Arguments& arguments, const TensorFile& file) {
+    Settings settings = settings_in(file);
+    if (arguments.has("--record")) require_other_file(arguments["--record"], file.path);
     if (settings.task != "gridworld") settings.mujoco = mujoco_version();  // of the library that steps the bodies here
     if (arguments.has("--episodes"))
         settings.eval_episodes = whole_number(arguments["--episodes"], "--episodes", 1, 10000);

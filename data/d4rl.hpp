@@ -15,6 +15,7 @@
 
 #include "../mujoco_env.hpp"
 #include "hdf5.hpp"  // and with it the standard headers
+#include "rows.hpp"
 #include "settings.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -206,7 +207,6 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
 // Errors: dataset.shape, those of minari_episodes() and hdf5.hpp.
 inline Rows read_minari(const Hdf5File& file) {
     Rows rows;
-    const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
     for (const uint64_t episode : minari_episodes(file)) {
         const std::string group = "episode_" + std::to_string(episode) + "/";
         const Hdf5Table actions = table_of(file, group + "actions");
@@ -220,12 +220,12 @@ inline Rows read_minari(const Hdf5File& file) {
                 states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
                 " and ", rows.action_dim, " columns");
         const std::vector<float> all = file.read<float>(states.data);
-        append(rows.observations, std::span(all).first(steps * rows.state_dim));
-        append(rows.next_observations, std::span(all).last(steps * rows.state_dim));
-        append(rows.actions, file.read<float>(actions.data));
-        append(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
-        append(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
-        append(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
+        append_all(rows.observations, std::span(all).first(steps * rows.state_dim));
+        append_all(rows.next_observations, std::span(all).last(steps * rows.state_dim));
+        append_all(rows.actions, file.read<float>(actions.data));
+        append_all(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
+        append_all(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
+        append_all(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;  // an episode ends where its group does
         rows.count += steps;
     }
@@ -367,22 +367,19 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
 
 // Writes episodes as a data set in D4RL's layout, for `info`, `train --dataset` and others: raw states, actions (a move
 // as its number), rewards, and the last row of each episode marked. Those whose simulation broke down are left out.
-// Errors: file.input if `path` is `input`, dataset.empty, file.write.
-inline void write_episodes(const std::string& path, const EnvironmentSpec& spec, const std::vector<Episode>& episodes,
-                           const std::string& input) {
+// Errors: dataset.empty, file.write.
+inline void write_episodes(const std::string& path, const EnvironmentSpec& spec, const std::vector<Episode>& episodes) {
     std::vector<float> observations, actions, rewards;
     std::vector<uint8_t> terminals, timeouts;
-    const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
     for (const Episode& episode : episodes) {
         if (!episode.error.empty()) continue;
-        append(observations, episode.trajectory.states);
-        append(actions, episode.trajectory.actions);
-        append(rewards, episode.trajectory.rewards);
+        append_all(observations, episode.trajectory.states);
+        append_all(actions, episode.trajectory.actions);
+        append_all(rewards, episode.trajectory.rewards);
         for (std::vector<uint8_t>* flags : {&terminals, &timeouts}) flags->resize(rewards.size());
         (episode.trajectory.terminated ? terminals : timeouts).back() = 1;
     }
     require(!rewards.empty(), "dataset.empty", path, ": there is no episode to write");
-    require_other_file(path, input);
     const uint64_t rows = rewards.size(), S = static_cast<uint64_t>(spec.state_dim);
     Hdf5Writer file(path);
     file.add("observations", {rows, S}, observations);

@@ -1182,7 +1182,7 @@ struct Hdf5Parser {
         if (g.whole_edges && partial) chunk.skipped = ~0u;
         require_at(offset, g.chunks.size() < g.all, "hdf5.format", "each chunk once");
         require_inside(chunk.address, chunk.size);
-        charge(offset, sizeof chunk);
+        charge(offset, sizeof chunk + chunk.place.size() * sizeof chunk.place[0]);
         g.chunks.push_back(chunk);
         g.stored += chunk.size;
     }
@@ -1205,7 +1205,11 @@ struct Hdf5Parser {
     // SPEC VII.B: chunk after chunk, without an index.
     void implicit_index(Grid& g) {
         uint64_t last = 0;  // number of the last chunk of the data set
-        for (size_t k = 0; k < g.step.size(); ++k) last += product(g.counts[g.order[k]] - 1, g.step[k], g.index);
+        for (size_t k = 0; k < g.step.size(); ++k) {
+            const uint64_t more = product(g.counts[g.order[k]] - 1, g.step[k], g.index);
+            require_at(g.index, more < ~last, "hdf5.too_large", "an index of at most 2^64 bytes");
+            last += more;
+        }
         require_inside(g.index, product(last + 1, g.chunk_bytes, g.index));
         for (uint64_t number = 0; number <= last; ++number)
             add(g, {g.index + number * g.chunk_bytes, g.chunk_bytes, 0, place_of(g, number)}, g.index);

@@ -104,7 +104,7 @@ inline void load_counts(ModelContents& model, const TensorFile& file) {
     model.evaluations = count("evaluations");
 }
 
-inline constexpr const char* checkpoint_format = "wodtem checkpoint 1";  // of run_folder.hpp
+inline constexpr const char* checkpoint_format = "wodtem checkpoint 2";  // of run_folder.hpp
 
 // Reads the network of an unfinished run from its checkpoint. Errors: model.value, safetensors.*.
 inline void load_unfinished(ModelContents& model, const TensorFile& file) {
@@ -144,22 +144,37 @@ inline void require_room(const TensorFile& file, const Settings& settings) {
             weights, " weights and more that its settings call for");
 }
 
-// Returns the path of a model: `given` itself, or the model file of the run's folder `given`; of an unfinished run its
-// checkpoint.
+// Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
 inline std::string model_path(const std::string& given) {
-    if (!std::filesystem::is_directory(given)) return given;
-    const std::string model = given + "/model.safetensors", checkpoint = given + "/checkpoint.safetensors";
-    return std::filesystem::exists(model) || !std::filesystem::exists(checkpoint) ? model : checkpoint;
+    return std::filesystem::is_directory(given) ? given + "/model.safetensors" : given;
 }
 
 // Errors: model.format, model.settings, safetensors.*, file.*.
 inline TensorFile open_model(const std::string& given) {
     TensorFile file = read_safetensors(model_path(given));
-    const std::string format = file.metadata.contains("format") ? file.text("format") : "";
-    require(format == model_format || format == checkpoint_format, "model.format", file.path,
+    require(file.metadata.contains("format") && file.text("format") == model_format, "model.format", file.path,
             " is a safetensors file, but no model that `wodtem train` has written");
     require_room(file, settings_in(file));
     return file;
+}
+
+// A model; of the folder of an unfinished run its checkpoint, which has the present network. Errors: those of
+// open_model(), checkpoint.format.
+inline TensorFile open_model_or_checkpoint(const std::string& given) {
+    const std::string checkpoint = given + "/checkpoint.safetensors";
+    if (std::filesystem::exists(model_path(given)) || !std::filesystem::exists(checkpoint)) return open_model(given);
+    TensorFile file = read_own_safetensors(checkpoint);
+    require(file.text("format") == checkpoint_format, "checkpoint.format", checkpoint,
+            " is no checkpoint of this version of `wodtem train`");
+    require_room(file, settings_in(file));
+    std::fprintf(stderr, "%s: the run is unfinished; this is its network after %s updates\n", given.c_str(),
+                 number_text(file.get<uint64_t>("progress.updates", {})[0]).c_str());
+    return file;
+}
+
+// The number of the first episode of a run's last evaluation among all episodes of its evaluations; settings: the run's.
+inline uint64_t first_of_last_evaluation(const ModelContents& model, const Settings& settings) {
+    return (std::max<uint64_t>(1, model.evaluations) - 1) * static_cast<uint64_t>(settings.eval_episodes);
 }
 
 // Reads the first network of a run from a model of the same shape. Errors: model.settings, and those of load_model().

@@ -78,10 +78,10 @@ struct Log {
         return out;
     }
 
-    // A column must hold text_of(i) for i from 0 to count - 1, from top to bottom. Errors: csv.rows.
-    void check_column(const char* column, int count, auto&& text_of) const {
+    // A column must hold expected_text(i) for i from 0 to count - 1, from top to bottom. Errors: csv.rows.
+    void check_column(const char* column, int count, auto&& expected_text) const {
         std::vector<std::string> expected;
-        for (int i = 0; i < count; ++i) expected.push_back(text_of(i));
+        for (int i = 0; i < count; ++i) expected.push_back(expected_text(i));
         const std::vector<std::string> got = texts(column);
         const auto differs = std::ranges::mismatch(got, expected).in1 - got.begin();
         if (got != expected)
@@ -708,7 +708,9 @@ inline Table method_table(const Group& group) {
 
 // What the memory changes of the loss, as progress.csv has it: mean of the last ten rows, in thousandths, over seeds.
 inline Table dose_table(const Group& group) {
-    Table table{{"The memory's dose, in thousandths", "Share of the loss", "Moves actions by", "Mean move"}, {}};
+    Table table{
+        {"The memory's dose, in thousandths", "Share of the loss", "Mean length of a move", "Length of the mean move"},
+        {}};
     for (const Row& row : group.rows) {
         const auto thousandths = [&](Quantity quantity) {
             Spread spread = spread_of(row.runs, last_ten, quantity);

@@ -39,7 +39,8 @@ struct Tally {
     double dropped = 0;  // episodes whose simulation broke down
     // The dose: what eq. (9) changes of eq. (2), as add_advice() sums it over updates.
     double advice = 0, advice_distance = 0;
-    std::vector<double> advice_shift = {};  // [action_dim], or [discrete_actions]; empty: zeros; not of visit()
+    std::vector<double> advice_shift =
+        {};  // [action_dim], or [discrete_actions]; empty before the first advice; see visit_state()
 
     void visit(auto& archive) {
         archive("progress.loss", loss);
@@ -139,7 +140,7 @@ inline std::string progress_line(const ProgressRow& row, const Settings& setting
 }
 
 // What is said of a run whose folder holds a part of it already, and of a run that is finished.
-inline void print_start(const std::string& path, bool resumed, uint64_t updates) {
+inline void print_continuation(const std::string& path, bool resumed, uint64_t updates) {
     if (resumed)
         std::fprintf(stderr, "%s: continuing at update %s\n", path.c_str(), number_text(updates).c_str());
     else
@@ -157,26 +158,28 @@ inline void print_end(const std::string& path, const ProgressRow& row, const Set
 // the standard deviation of the returns over them.
 inline void print_evaluation(const Settings& settings, const std::vector<Episode>& episodes, double mean_length,
                              double mean_return) {
-    size_t count = 0;
+    size_t number = 0, count = 0;
     double squares = 0;
     for (const Episode& episode : episodes) {
+        ++number;
         if (!episode.error.empty()) {
-            std::fprintf(stderr, "wodtem: an episode is dropped: %s\n", episode.error.c_str());
+            std::fprintf(stderr, "wodtem: episode %zu is dropped: %s\n", number, episode.error.c_str());
             continue;
         }
         count += 1;
         const double total = total_return(episode.trajectory);
         squares += (total - mean_return) * (total - mean_return);
-        std::printf("episode %zu: length %d, return %s", count, episode.trajectory.length(),
+        std::printf("episode %zu: length %d, return %s", number, episode.trajectory.length(),
                     number_text(static_cast<float>(total)).c_str());
         for (const float move : episode.trajectory.actions)
             if (settings.task == "gridworld") std::printf(" %s", grid_move_table[static_cast<size_t>(move)].name);
         std::printf("\n");
     }
-    const float deviation = count > 1 ? static_cast<float>(std::sqrt(squares / static_cast<double>(count - 1))) : 0;
-    std::printf("%s, %s, seed %lld: mean length %s, mean return %s +- %s%s over %zu episode%s (%s)\n",
+    const std::string deviation =
+        count > 1 ? " +- " + number_text(static_cast<float>(std::sqrt(squares / static_cast<double>(count - 1)))) : "";
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s%s over %zu episode%s (%s)\n",
                 settings.task.c_str(), settings.method.c_str(), static_cast<long long>(settings.seed),
-                number_text(mean_length).c_str(), number_text(mean_return).c_str(), number_text(deviation).c_str(),
+                number_text(mean_length).c_str(), number_text(mean_return).c_str(), deviation.c_str(),
                 score_text(settings, mean_return).c_str(), count, count == 1 ? "" : "s",
                 physics_text(settings).c_str());
 }
@@ -312,7 +315,7 @@ inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit
     try {
         const TensorFile file = read_own_safetensors(path);
         const bool checkpoint = file.text("format") == checkpoint_format;
-        require(checkpoint, "checkpoint.format", "it is no checkpoint of `wodtem train`");
+        require(checkpoint, "checkpoint.format", "it is no checkpoint of this version of `wodtem train`");
         require_same_settings(settings_from_text(file.text("settings"), path), settings, path);
         Loader loader{file};
         folder.visit(loader);

@@ -432,7 +432,7 @@ inline void check_together(const Settings& settings) {
         fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
              batch_size, context_length);
     if (settings.cut == "episodes" && !settings.task.starts_with("maze2d"))
-        fail("usage.setting", "cut=episodes is for maze2d, whose data have no episodes; %s has cut=flags",
+        fail("usage.setting", "cut=episodes is for maze2d, whose file is one walk without an end; %s has cut=flags",
              settings.task.c_str());
     if (online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
