@@ -551,6 +551,21 @@ TEST(hdf5_blocks_too_small_and_layouts_that_come_twice_are_refused) {
     CHECK_FAILS("hdf5.format", parse(twice));
 }
 
+// The implicit index of [7, 5] values in chunks [2, 3] that may grow to [7, 2^64 - 2]: its last chunk's number,
+// 3 (2^64 - 1) / 3 + 1, is 2^64, of which 64 bits leave 0.
+TEST(hdf5_index_whose_last_number_overflows_is_refused) {
+    std::string bytes = fixture("latest");
+    const auto structures = checksummed(bytes);
+    std::string shape;
+    for (const uint64_t extent : {7, 5, 7, 8}) shape.append(reinterpret_cast<const char*>(&extent), 8);
+    const size_t at = bytes.find(shape);
+    CHECK(at != std::string::npos && bytes.find(shape, at + 1) == std::string::npos);
+    parse(bytes);
+    set_u64(bytes, at + 24, ~uint64_t{1});
+    seal(bytes, structures);
+    CHECK_FAILS("hdf5.too_large", parse(bytes));
+}
+
 TEST(hdf5_sizes_out_of_proportion_are_refused) {
     const Folder folder;
     const std::string path = folder / "out.hdf5";
