@@ -72,7 +72,8 @@ inline const int mutant = std::getenv("MUTANT") ? std::atoi(std::getenv("MUTANT"
 if [ "${1:-}" = apply ]; then exit 0; fi
 make -C $work -j2 CXXFLAGS='-std=c++20 -O1 -w -pthread -ffp-contract=off -fno-math-errno -include mutant.hpp' \
     wodtem build/tests > $work/build.log 2>&1 || { tail -20 $work/build.log; exit 1; }
-cp ./*.hpp ./*.cpp $work  # tests that read the sources read the right ones
+cp -r ./*.hpp ./*.cpp data tests $work  # tests that read the sources read the right ones
+rm $work/mutant.hpp
 
 cd $work
 for command in './wodtem check tests/vectors/*.safetensors' build/tests; do
