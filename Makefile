@@ -13,8 +13,8 @@
 #   make clean            remove what was built (runs/ stays)
 
 CXX = g++
-# -O2 with loops in vectors, peeled and unswitched: as fast here as -O3, and compiled sooner; wodtem.cpp lowers it for
-# what does not compute. No result depends on the level.
+# -O2 with loops in vectors, peeled and unswitched: as fast as -O3, and compiled sooner (tests/BENCH.md); wodtem.cpp
+# lowers it for what takes little time. No result depends on the level.
 # -ffp-contract=off: one rounding an operation everywhere but in the kernels that say otherwise.
 # -Wno-restrict: GCC 12 warns about memcpy inside std::string that cannot happen (GCC bug 105651).
 # -fno-math-errno: a square root is an instruction.

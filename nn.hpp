@@ -462,8 +462,7 @@ ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
 //     a[1]     sum[1][0]     sum[1][1]        sum[r][v] += a[r] * row_of_b[v]:
 //     ...                                     Rows * Vectors multiply-adds for Rows + Vectors loads
 //
-// 12 x 2 sums fill 24 of AVX-512's 32 registers and 6 x 2 sums 12 of AVX2's 16; the others hold a row of B and one of
-// A.
+// 12 x 2 sums fill 24 of AVX-512's 32 registers and 6 x 2 sums 12 of AVX2's 16; the others hold A's and B's elements.
 template <int Rows, int Vectors, int Width, Multiply How>
 ALWAYS_INLINE void compute_tile(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
     constexpr int columns = Width * Vectors, k_a_word = in_bf16(How) ? 2 : 1;
@@ -1999,8 +1998,8 @@ Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
         [=](ptrdiff_t i, T dy) { log_p.grad()[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
 }
 
-// DT's loss for continuous actions: the squared error of each row, averaged over the action's dimensions. actions [n,
-// A].
+// DT's loss for continuous actions: the squared error of each row, averaged over the action's A dimensions.
+// actions [n, A].
 template <class T>
 Tensor<T> squared_error(Tape<T>& tape, Tensor<T> prediction, const float* actions) {
     const Tensor<T> a = tape.constant(actions, prediction.rows, prediction.columns);

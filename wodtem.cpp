@@ -18,7 +18,6 @@
 #include <cmath>
 #include <cstdint>
 #include <functional>
-#include <memory>
 #include <span>
 #include <string>
 #include <vector>
@@ -27,7 +26,7 @@
 #include "memory.hpp"
 #include "mujoco_env.hpp"
 #include "nn.hpp"
-// What follows is compiled quickly, since no loop in it takes a noticeable share of an update.
+// What follows is compiled quickly: files, words, and the method itself, whose loops take little of an update.
 #pragma GCC optimize("O1")
 #include "data/collect.hpp"
 #include "data/command_line.hpp"
@@ -560,7 +559,8 @@ struct Evaluation {
     std::vector<Episode> episodes;
 };
 
-// Sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. first: of the evaluations' episodes.
+// Sec. III-B: the mean (or the most probable action) of the policy, g_1 = g_eval. first: the number of its first
+// episode among those of all evaluations of the run.
 Evaluation evaluate(const Agent& agent, Tape<float>& acting, std::span<Environment* const> environments,
                     uint64_t first) {
     Evaluation result;
@@ -892,7 +892,7 @@ void command_train(const Arguments& arguments) {
     }
 }
 
-// From the model file alone; neither memory nor buffer is built. Without --seed: the run's last evaluation again.
+// From the model or checkpoint alone, without memory or buffer. Without --seed: the run's last evaluation again.
 void command_eval(const Arguments& arguments) {
     const TensorFile file = open_model_or_checkpoint(arguments.words[0]);
     const Settings settings = evaluated_settings(arguments, file);
@@ -906,7 +906,7 @@ void command_eval(const Arguments& arguments) {
     const Environments environments(*make_environment(settings), settings.eval_episodes);
     const Evaluation evaluation = evaluate(agent, acting, environments.all(), first);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
-    if (arguments.has("--record")) write_episodes(arguments["--record"], agent.spec, evaluation.episodes);
+    if (arguments.has("--record")) write_episodes(arguments["--record"], evaluation.episodes);
 }
 
 // From a model to ODT's code, and back.

@@ -245,12 +245,7 @@ template <class T>
 void write_set(const std::string& path, const CollectedRows<T>& rows, size_t steps, const Origin& origin,
                const std::function<void(Hdf5Writer&)>& add = {}) {
     Hdf5Writer file(path);
-    rows.each_array([&](const char* name, auto array, bool is_table) {
-        const auto& values = rows.*array;
-        if (values.empty()) return;
-        const size_t width = values.size() / rows.length();
-        file.add(name, is_table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
-    });
+    write_rows(file, rows, steps);
     if (add) add(file);
     file.text("metadata/made_by", origin.command);
     file.text("metadata/note", "a stand-in made by wodtem, not D4RL's data");

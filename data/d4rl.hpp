@@ -365,28 +365,33 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
     return trajectories;
 }
 
+// Writes the first `steps` rows of all arrays under their names in D4RL's files. Errors: file.write.
+template <class T>
+void write_rows(Hdf5Writer& file, const CollectedRows<T>& rows, size_t steps) {
+    rows.each_array([&](const char* name, auto array, bool is_table) {
+        const auto& values = rows.*array;
+        if (values.empty()) return;
+        const size_t width = values.size() / rows.length();
+        file.add(name, is_table ? Shape{steps, width} : Shape{steps}, std::span(values).first(steps * width));
+    });
+}
+
 // Writes episodes as a data set in D4RL's layout, for `info`, `train --dataset` and others: raw states, actions (a move
 // as its number), rewards, and the last row of each episode marked. Those whose simulation broke down are left out.
 // Errors: dataset.empty, file.write.
-inline void write_episodes(const std::string& path, const EnvironmentSpec& spec, const std::vector<Episode>& episodes) {
-    std::vector<float> observations, actions, rewards;
-    std::vector<uint8_t> terminals, timeouts;
+inline void write_episodes(const std::string& path, const std::vector<Episode>& episodes) {
+    CollectedRows<float> rows;
     for (const Episode& episode : episodes) {
         if (!episode.error.empty()) continue;
-        append_all(observations, episode.trajectory.states);
-        append_all(actions, episode.trajectory.actions);
-        append_all(rewards, episode.trajectory.rewards);
-        for (std::vector<uint8_t>* flags : {&terminals, &timeouts}) flags->resize(rewards.size());
-        (episode.trajectory.terminated ? terminals : timeouts).back() = 1;
+        append_all(rows.observations, episode.trajectory.states);
+        append_all(rows.actions, episode.trajectory.actions);
+        append_all(rows.rewards, episode.trajectory.rewards);
+        for (auto* flags : {&rows.terminals, &rows.timeouts}) flags->resize(rows.rewards.size());
+        (episode.trajectory.terminated ? rows.terminals : rows.timeouts).back() = 1;
     }
-    require(!rewards.empty(), "dataset.empty", path, ": there is no episode to write");
-    const uint64_t rows = rewards.size(), S = static_cast<uint64_t>(spec.state_dim);
+    require(rows.length() > 0, "dataset.empty", path, ": there is no episode to write");
     Hdf5Writer file(path);
-    file.add("observations", {rows, S}, observations);
-    file.add("actions", {rows, static_cast<uint64_t>(spec.action_dim)}, actions);
-    file.add("rewards", {rows}, rewards);
-    file.add("terminals", {rows}, terminals);
-    file.add("timeouts", {rows}, timeouts);
+    write_rows(file, rows, rows.length());
     file.close();
 }
 

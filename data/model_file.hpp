@@ -172,8 +172,7 @@ inline TensorFile open_model_or_checkpoint(const std::string& given) {
     return file;
 }
 
-// The number of the first episode of a run's last evaluation among all episodes of its evaluations; settings: the
-// run's.
+// The number of the first episode of a run's last evaluation among those of all its evaluations, by the run's settings.
 inline uint64_t first_of_last_evaluation(const ModelContents& model, const Settings& settings) {
     return (std::max<uint64_t>(1, model.evaluations) - 1) * static_cast<uint64_t>(settings.eval_episodes);
 }

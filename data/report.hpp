@@ -708,9 +708,9 @@ inline Table method_table(const Group& group) {
 
 // What the memory changes of the loss, as progress.csv has it: mean of the last ten rows, in thousandths, over seeds.
 inline Table dose_table(const Group& group) {
-    Table table{
-        {"The memory's dose, in thousandths", "Share of the loss", "Mean length of a move", "Length of the mean move"},
-        {}};
+    Table table{{"The memory's dose, in thousandths", "Share of the loss", "Mean length of a shift",
+                 "Length of the mean shift"},
+                {}};
     for (const Row& row : group.rows) {
         const auto thousandths = [&](Quantity quantity) {
             Spread spread = spread_of(row.runs, last_ten, quantity);
@@ -811,10 +811,9 @@ inline Section make_section(const Runs& runs) {
     if (!group.in_all.rows.empty()) section.parts.emplace_back(group.in_all);
     if (const Table doses = dose_table(group); !doses.rows.empty()) {
         section.parts.emplace_back(
-            "The dose: 1 - w is the share of the loss that is the memory's advice, a-hat in the place of a. It moves "
-            "what the policy is fitted to by (1 - w) (a-hat - a) at a step; on the grid world that much probability "
-            "moves. Here: the mean length of these moves, and the length of the mean move, in which moves to and fro "
-            "cancel.");
+            "The dose: 1 - w is the share of the loss that is the memory's advice, a-hat in the place of a. It shifts "
+            "what the policy is fitted to by (1 - w) (a-hat - a) at a step; on the grid world that much probability. "
+            "Here: the mean length of these shifts, and the length of the mean shift, in which opposite ones cancel.");
         section.parts.emplace_back(doses);
     }
     (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);

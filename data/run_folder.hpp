@@ -37,10 +37,10 @@ struct Tally {
     double matched = 0, evicted = 0;  // states that the table already held; entries that it gave up
     double rollout_length = 0, rollout_return = 0, rollouts = 0;
     double dropped = 0;  // episodes whose simulation broke down
-    // The dose: what eq. (9) changes of eq. (2), as add_advice() sums it over updates.
+    // The dose: what eq. (9) changes of eq. (2), as add_advice() sums it over updates. advice_shift [action_dim], or
+    // [discrete_actions], is empty before the first advice; visit_state() saves it.
     double advice = 0, advice_distance = 0;
-    std::vector<double> advice_shift =
-        {};  // [action_dim], or [discrete_actions]; empty before the first advice; see visit_state()
+    std::vector<double> advice_shift = {};
 
     void visit(auto& archive) {
         archive("progress.loss", loss);
@@ -70,21 +70,25 @@ inline double length_of_shift(const std::vector<double>& shift, bool discrete) {
 
 // Adds a step's share of the dose. Eq. (2) fits the policy to a, eq. (9) to w a + (1 - w) a-hat, where a discrete
 // action is a distribution over the moves, all on one. advice: (1 - w) times the step's coefficient in the loss; its
-// sum is the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which moves to and
-// fro cancel, and the length of each step's shift. a, a_hat: [action_dim].
+// sum is the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which opposite
+// shifts cancel, and the length of each step's shift. a, a_hat: [action_dim].
 inline void add_advice(Tally& tally, const EnvironmentSpec& spec, double advice, const float* a, const float* a_hat) {
-    const bool discrete = spec.discrete_actions > 0;
-    std::vector<double> shift(discrete ? spec.discrete_actions : spec.action_dim);
-    if (discrete) {
-        shift[static_cast<size_t>(*a_hat)] += advice;
-        shift[static_cast<size_t>(*a)] -= advice;
-    }
-    for (size_t j = 0; !discrete && j < shift.size(); ++j)
-        shift[j] = advice * (static_cast<double>(a_hat[j]) - static_cast<double>(a[j]));
     tally.advice += advice;
-    tally.advice_distance += length_of_shift(shift, discrete);
-    tally.advice_shift.resize(shift.size());
-    for (size_t j = 0; j < shift.size(); ++j) tally.advice_shift[j] += shift[j];
+    if (spec.discrete_actions > 0) {
+        tally.advice_shift.resize(spec.discrete_actions);
+        tally.advice_shift[static_cast<size_t>(*a_hat)] += advice;
+        tally.advice_shift[static_cast<size_t>(*a)] -= advice;
+        tally.advice_distance += *a_hat == *a ? 0 : advice;
+        return;
+    }
+    tally.advice_shift.resize(spec.action_dim);
+    double squares = 0;
+    for (size_t j = 0; j < tally.advice_shift.size(); ++j) {
+        const double shift = advice * (static_cast<double>(a_hat[j]) - static_cast<double>(a[j]));
+        tally.advice_shift[j] += shift;
+        squares += shift * shift;
+    }
+    tally.advice_distance += std::sqrt(squares);
 }
 
 struct ProgressRow {

@@ -533,6 +533,7 @@ TEST(advice_to_and_fro_has_a_distance_and_no_shift) {
     add_advice(tally, spec, 0.25, origin.data(), away.data());
     CHECK_CLOSE(length_of_shift(tally.advice_shift, false), 0.25 * 1.25, 1e-12);
     add_advice(tally, spec, 0.25, away.data(), origin.data());
+    CHECK_EQUAL(length_of_shift({0.25, 0, -0.25}, true), 0.25);  // the probability that goes from one move to another
     CHECK_EQUAL(tally.advice, 0.5);
     CHECK_CLOSE(tally.advice_distance, 0.5 * 1.25, 1e-12);
     CHECK_EQUAL(length_of_shift(tally.advice_shift, false), 0.0);
