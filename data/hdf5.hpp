@@ -1207,7 +1207,7 @@ struct Hdf5Parser {
         uint64_t last = 0;  // number of the last chunk of the data set
         for (size_t k = 0; k < g.step.size(); ++k) {
             const uint64_t more = product(g.counts[g.order[k]] - 1, g.step[k], g.index);
-            require_at(g.index, more < ~last, "hdf5.too_large", "an index of at most 2^64 bytes");
+            require_at(g.index, more < ~last, "hdf5.too_large", "numbers of chunks of at most 64 bits");
             last += more;
         }
         require_inside(g.index, product(last + 1, g.chunk_bytes, g.index));
