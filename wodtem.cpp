@@ -213,6 +213,22 @@ struct Batch {
     double short_pairs = 0;                  // steps with d_c < e-hat
 };
 
+// Appends step t of a trajectory, whose returns are those of relabel(): they do not depend on the window.
+void append_step(Batch& batch, const Agent& agent, const Trajectory& trajectory, int t) {
+    const float* state = &trajectory.states[t * agent.spec.state_dim];
+    const float* action = &trajectory.actions[t * agent.spec.action_dim];
+    // The network reads g_t times reward_scale. d_t stays in units of the reward: eqs. (5) and (7) compare it
+    // with e, which is a d_t too, and eq. (6) takes exp(e) as it is.
+    const double g = trajectory.returns_to_go[t] * agent.settings.reward_scale;
+    batch.sequences.returns_to_go.push_back(static_cast<float>(g));
+    append_normalised(batch.sequences.states, agent.normaliser, state);
+    append_action_token(batch.sequences.actions, agent.spec, action);
+    batch.sequences.timesteps.push_back(t);
+    append_action(batch.actions, agent.spec, action);
+    batch.discounted_returns.push_back(trajectory.discounted_returns[t]);
+    batch.raw_states.push_back(state);
+}
+
 // WODTEM sec. IV-B.3, step 1: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}, d_{-C,t}) from the replay buffer: windows
 // [first, end) of this update's batch, all weights 1.
 Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
@@ -223,23 +239,10 @@ Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
     for (uint32_t window = first; window < end; ++window) {
         const Window at = run.replay.sample(agent.random(Stream::batch), run.progress.updates, window,
                                             static_cast<int>(context_length), draw);
-        // g_t and d_t were computed when the trajectory entered the buffer (relabel): they do not depend on the window.
         const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
         batch.sequences.lengths.push_back(at.length);
         for (int c = 0; c < at.length; ++c) {
-            const int t = at.start + c;
-            const float* state = &trajectory.states[t * agent.spec.state_dim];
-            const float* action = &trajectory.actions[t * agent.spec.action_dim];
-            // The network reads g_t times reward_scale. d_t stays in units of the reward: eqs. (5) and (7) compare it
-            // with e, which is a d_t too, and eq. (6) takes exp(e) as it is.
-            const double g = trajectory.returns_to_go[t] * agent.settings.reward_scale;
-            batch.sequences.returns_to_go.push_back(static_cast<float>(g));
-            append_normalised(batch.sequences.states, agent.normaliser, state);
-            append_action_token(batch.sequences.actions, agent.spec, action);
-            batch.sequences.timesteps.push_back(t);
-            append_action(batch.actions, agent.spec, action);
-            batch.discounted_returns.push_back(trajectory.discounted_returns[t]);
-            batch.raw_states.push_back(state);
+            append_step(batch, agent, trajectory, at.start + c);
             batch.coefficients.push_back(1.0 / static_cast<double>(agent.settings.batch_size * at.length));
             batch.random_index.push_back(window * context_length + static_cast<uint32_t>(c));
         }
@@ -590,6 +593,7 @@ struct Observer {
     std::function<void(const ProgressRow&, const Evaluation&)> evaluated;
     std::function<void(const EpisodeRow&)> played;    // an online episode
     std::function<void(const std::string&)> dropped;  // an episode whose simulation broke down; the sentence
+    std::function<void()> ending = [] {};     // before the last evaluation: a larger budget would go on from here
     std::function<void(double share)> pause;  // after each update and episode, when the state is complete: a checkpoint
                                               // may be saved, and an error thrown to stop. share: of the phase's work
 };
@@ -645,6 +649,7 @@ void offline_phase(Run& run, const Observer& observer) {
         update(run);
         observer.pause(static_cast<double>(run.progress.updates) / static_cast<double>(updates));
     }
+    if (run.agent.settings.online_steps == 0) observer.ending();
     evaluate_and_report(run, observer);
 }
 
@@ -693,6 +698,7 @@ void online_phase(Run& run, const Observer& observer) {
         }
         // The last evaluation follows the last episode's updates; that episode may exceed the budget by its length.
         const bool last = p.interactions >= budget;
+        if (last) observer.ending();
         if (p.episodes >= p.next_evaluation || last) evaluate_and_report(run, observer);
         if (last) return;
         interact(run, observer);
@@ -737,47 +743,19 @@ bool begin_or_continue(Run& run, RunFolder& folder) {
     return resumed;
 }
 
+// What trains on a file alone, acts on lines of text and asks the policy for figures, by the functions above.
+#include "data/grid_results.hpp"
+#include "data/own_data.hpp"
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Training in a folder: the phases above, with the run folder and the console as their observer.
-
-// The learned policy's distribution over actions in every cell, at the start of an evaluation: [36][8].
-std::vector<std::vector<float>> policy_by_cell(Run& run, GridWorld world) {
-    const Settings& settings = run.agent.settings;
-    std::vector<Episode> episodes(grid_cells);  // one that begins in each cell
-    std::vector<Episode*> running;
-    for (world.cell = 0; world.cell < grid_cells; ++world.cell) {
-        Episode& episode = episodes[world.cell];
-        episode.state.resize(run.agent.spec.state_dim);
-        world.observe(episode.state.data());
-        append_target(episode, settings.g_eval, settings.reward_scale);
-        running.push_back(&episode);
-    }
-    run.acting.reset();
-    const Policy<float> policy =
-        forward(run.acting, run.agent.model, acting_batch(run.agent, running), Queries::last_state);
-    std::vector<std::vector<float>> probabilities(grid_cells);
-    for (size_t i = 0; i < policy.output.size(); ++i)
-        probabilities[i / grid_moves].push_back(std::exp(policy.output.value[i]));
-    return probabilities;
-}
-
-// What the figures of a finished run on the grid world need: the policy in every cell, and the shares of the moves at S
-// (figs. 1d and 4b).
-void save_grid_results(Run& run, const RunFolder& folder) {
-    const Settings& settings = run.agent.settings;
-    const GridWorld world = make_grid_world(settings);
-    const std::vector<std::vector<float>> probabilities = policy_by_cell(run, world);
-    std::vector<double> online;
-    if (run.progress.online != 0) online = moves_at_start(run.replay.trajectories, world);
-    save_policy(folder, probabilities);
-    save_start_actions(folder, probabilities[grid_start], moves_at_start(make_data_set(settings), world), online);
-}
 
 // What a run does not depend on.
 struct TrainOptions {
     const Kernel& kernel;
     int threads = 1;
     double checkpoint_every = 30;  // seconds; when a checkpoint is saved decides nothing but what a kill costs
+    bool keep_state = false;       // of a finished run, so that it can go on with a larger budget
     std::string label = "";        // begins each line of progress
     double later_updates = 0;      // of the runs that follow this one, for the time left
     std::function<bool()> asked_to_stop = [] { return stop_requested != 0; };
@@ -793,12 +771,15 @@ struct Watcher {
     Clock::time_point began = Clock::now();
     uint64_t first_update = run.progress.updates;
 
+    void save() {
+        save_checkpoint(folder, run.agent.settings, [&](auto& archive) { visit_state(archive, run); });
+    }
+
     // Errors: run.stopped after a checkpoint that was saved because the user asked to stop; file.*.
     void save_if_due() {
         const bool stop = options.asked_to_stop();
         if (!stop && !timer.due()) return;
-        timer.time(
-            [&] { save_checkpoint(folder, run.agent.settings, [&](auto& archive) { visit_state(archive, run); }); });
+        timer.time([&] { save(); });
         if (!stop) return;
         console.end_line();
         fail("run.stopped", "stopped after update %llu; everything is saved in %s, and the same command continues",
@@ -825,7 +806,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     const FolderLock lock(path);
     RunFolder folder{path};
     claim_folder(folder, settings);
-    if (is_finished_already(folder)) return;
+    if (is_finished_already(folder, options.keep_state)) return;
     Compute compute(options.kernel, options.threads);
     std::optional<StopAtOnce> drawing_and_reading(std::in_place);  // which may take long
     if (options.asked_to_stop()) fail("run.stopped", "%s", nothing_to_save.data());
@@ -833,7 +814,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     const bool had_log = folder.has("progress.csv"), resumed = begin_or_continue(run, folder);
     drawing_and_reading.reset();
     if (resumed || had_log) print_continuation(path, resumed, run.progress.updates);
-    if (!resumed) folder.begin_logs();
+    if (!resumed) folder.begin_logs(settings);
 
     // Each event of the run has its row in a log; rows come before the checkpoint that counts them.
     Watcher watcher{run, folder, options};
@@ -845,12 +826,16 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     };
     observer.played = [&](const EpisodeRow& row) { folder.episodes.append(episode_line(row, settings)); };
     observer.dropped = [](const std::string& sentence) { std::fprintf(stderr, "wodtem: %s\n", sentence.c_str()); };
+    if (options.keep_state) observer.ending = [&] { watcher.save(); };
     observer.pause = [&](double share) {
         watcher.save_if_due();
         watcher.show(share);
     };
     try {
-        if (run.progress.online == 0) offline_phase(run, observer);
+        if (settings.task == own_data)
+            fit_own_data(run, observer);
+        else if (run.progress.online == 0)
+            offline_phase(run, observer);
         if (settings.online_steps > 0) online_phase(run, observer);
     } catch (const Error& error) {
         if (error.id == "nn.stopped") watcher.save_if_due();  // which ends in run.stopped
@@ -869,8 +854,8 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     save_model(contents, folder.file("model.safetensors"));
     if (settings.task == "gridworld") save_grid_results(run, folder);
     write_file_atomic(folder.file("finished"), "");
-    remove_checkpoint(folder);
-    print_end(path, progress_row(run), settings);
+    retire_checkpoint(folder, options.keep_state);
+    if (settings.task != own_data) print_end(path, progress_row(run), settings);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -886,27 +871,28 @@ void command_train(const Arguments& arguments) {
     for (size_t i = 0; i < runs.size(); ++i) {
         announce(runs[i]);
         const int threads = arguments["--threads"] == "0" ? default_threads(runs[i].settings) : thread_count(arguments);
-        TrainOptions options{kernel_of(arguments), threads, static_cast<double>(seconds), runs[i].label};
+        TrainOptions options{kernel_of(arguments), threads, static_cast<double>(seconds), arguments.has("--keep-state"),
+                             runs[i].label};
         for (size_t later = i + 1; later < runs.size(); ++later) options.later_updates += updates[later];
         train(runs[i].settings, runs[i].folder, options);
     }
 }
 
-// From the model or checkpoint alone, without memory or buffer. Without --seed: the run's last evaluation again.
+// Without --seed: the run's last evaluation again.
 void command_eval(const Arguments& arguments) {
-    const TensorFile file = open_model_or_checkpoint(arguments.words[0]);
-    const Settings settings = evaluated_settings(arguments, file);
-    Agent agent(settings, spec_of(settings));
-    ModelContents contents = contents_of(agent);
-    load_model(contents, file);
-    Compute compute(kernel_of(arguments), thread_count(arguments));
-    Tape<float> acting(compute);
-    acting.recording = false;
-    const uint64_t first = arguments.has("--seed") ? 0 : first_of_last_evaluation(contents, settings_in(file));
+    Actor actor(arguments);
+    const Settings& settings = actor.settings;
+    const uint64_t first =
+        arguments.has("--seed") ? 0 : first_of_last_evaluation(actor.contents, settings_in(actor.file));
     const Environments environments(*make_environment(settings), settings.eval_episodes);
-    const Evaluation evaluation = evaluate(agent, acting, environments.all(), first);
+    const Evaluation evaluation = evaluate(actor.agent, actor.acting, environments.all(), first);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
     if (arguments.has("--record")) write_episodes(arguments["--record"], evaluation.episodes);
+}
+
+void command_act(const Arguments& arguments) {
+    Actor actor(arguments);
+    act_on_lines(actor.agent, actor.acting, arguments.words.size() > 1 ? arguments.words[1] : "");
 }
 
 // From a model to ODT's code, and back.
@@ -923,28 +909,6 @@ void command_import(const Arguments& arguments) {
         model.state_mean = normaliser.mean;
         model.state_std = normaliser.deviation;
     });
-}
-
-// Seconds that a run takes here: the mean time of three updates, after one that allocates, times all updates expected.
-double estimated_seconds(Settings settings, const Kernel& kernel) {
-    if (settings.task != "gridworld") settings.behaviour = "random";
-    Compute compute(kernel, default_threads(settings));
-    Run run(compute, settings, *make_environment(settings));
-    begin_run(run, make_data_set(settings));
-    update(run);
-    const Clock::time_point begin = Clock::now();
-    for (int i = 0; i < 3; ++i) update(run);
-    return seconds_since(begin) / 3 * expected_updates(settings);
-}
-
-// With --estimate each method's update is timed on this machine first.
-void command_sweep(const Arguments& arguments) {
-    const std::vector<Settings> sweep = swept_settings(arguments);
-    const Kernel& kernel = kernel_of(arguments);
-    double seconds = 0;
-    if (arguments.has("--estimate"))
-        for (const Settings& settings : sweep) seconds += estimated_seconds(settings, kernel);
-    print_sweep(sweep, arguments, seconds);
 }
 
 // Without --steps as many rows as D4RL's data set has.
@@ -972,10 +936,22 @@ void command_report(const Arguments& arguments) {
 #include "tests/bench.hpp"
 #include "tests/check.hpp"
 
+// With --estimate each method's update is timed on this machine first.
+void command_sweep(const Arguments& arguments) {
+    const std::vector<Settings> sweep = swept_settings(arguments);
+    const Kernel& kernel = kernel_of(arguments);
+    double seconds = 0;
+    if (arguments.has("--estimate"))
+        for (const Settings& settings : sweep) seconds += estimated_seconds(settings, kernel);
+    print_sweep(sweep, arguments, seconds);
+}
+
 const Command commands[] = {
-    {"train", "TASK", 1, 1, "offline phase, online phase, evaluations; continues what is there", command_train,
+    {"train", "TASK|FILE", 1, 1, "offline phase, online phase, evaluations; continues what is there", command_train,
      settings_help},
     {"eval", "MODEL", 1, 1, "evaluate a saved model; needs nothing else", command_eval},
+    {"act", "MODEL [FILE]", 1, 2, "actions of a saved model for states that are given line by line", command_act,
+     act_help},
     {"export", "MODEL OUT", 2, 2, "write a model's weights for another program", command_export},
     {"import", "FILE OUT", 2, 2, "make a model of weights under ODT's names, in a safetensors file", command_import},
     {"collect", "ID", 1, 1, "make a stand-in for one of D4RL's data sets, in its layout", command_collect,

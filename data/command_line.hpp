@@ -40,6 +40,9 @@ inline const Option option_table[] = {
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
     {"train", "--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"},
+    {"act", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
+    {"train", "--keep-state", nullptr, "",
+     "so that a finished run can go on with more online_steps or offline_updates"},
     {"eval", "--episodes", "N", "", "episodes (default: as many as the run's evaluations have)"},
     {"eval", "--seed", "N", "", "of the starts (default: the starts of the run's last evaluation)"},
     {"eval", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
@@ -59,11 +62,11 @@ inline const Option option_table[] = {
     {"check", "-v", nullptr, "", "print inputs, the file's values and the program's"},
     {"check", "--dump", "FILE", "", "write every tensor of one update of a run instead, as a case of topic step"},
     {"check", "--run", "DIR", "", "of this run: its next update if it has a checkpoint, else its first; dropout off"},
-    {"train eval import sweep bench check", "--kernel", "NAME", "auto",
+    {"train eval act import sweep bench check", "--kernel", "NAME", "auto",
      "of matrix products: avx512 or avx2 (arithmetic fused), portable (plain); auto: the best there is"},
-    {"train eval import sweep check", "--precision", "NAME", "fp32",
+    {"train eval act import sweep check", "--precision", "NAME", "fp32",
      "of matrix products: fp32, or bf16, whose sums stay fp32 (avx512, on request portable)"},
-    {"train eval collect bench check", "--threads", "N", "0",
+    {"train eval act collect bench check", "--threads", "N", "0",
      "worker threads; 0: one per core, in train one alone for a small network; results do not depend on it"},
     {"bench", "--json", nullptr, "", "of updates: print one JSON array"},
 };
@@ -307,9 +310,38 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
     settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
 }
 
+// What own data decide by themselves: sizes, the entropy's bound, and what a return is compared with. Errors: those of
+// load_own_data().
+inline void choose_own_data(Settings& settings, const std::string& path) {
+    settings.dataset_path = path;
+    settings.dataset_sha256 = sha256_of_file(path);
+    settings.dataset = std::filesystem::path(path).filename();
+    settings.source["dataset"] = "own data";
+    const OwnData data = load_own_data(path);
+    double best = -INFINITY, largest = 0;  // of the returns; of their absolute values
+    for (const Trajectory& trajectory : data.trajectories) {
+        const double total = returns_to_go(trajectory.rewards).front();
+        best = std::max(best, total);
+        largest = std::max(largest, std::fabs(total));
+    }
+    const auto set = [&](const char* name, double value, const char* source) {
+        set_from(settings, name, number_text(value), source);
+    };
+    set("state_dim", data.spec.state_dim, "the data set");
+    set("action_dim", data.spec.action_dim, "the data set");
+    set("moves", data.spec.discrete_actions, "the data set: 0 where actions are continuous");
+    set("eta", -data.spec.action_dim, "ODT's code: minus the action dimensions");
+    set("g_eval", best, "chosen: the highest return in the data set");
+    set("g_online", best, "not used: there is no environment");
+    if (largest > 0)
+        set("reward_scale", std::pow(10.0, -std::floor(std::log10(largest))),
+            "chosen: a power of ten, so that the largest return is from 1 to 10");
+}
+
 // Settings that options or what they name decide.
-constexpr std::string_view not_for_set[] = {"task",   "method",  "preset",         "seed",         "arithmetic",
-                                            "mujoco", "dataset", "dataset_sha256", "first_weights"};
+constexpr std::string_view not_for_set[] = {"task",          "method",    "preset",     "seed",
+                                            "arithmetic",    "mujoco",    "dataset",    "dataset_sha256",
+                                            "first_weights", "state_dim", "action_dim", "moves"};
 
 // NAME=VALUE of each --set. Errors: usage.setting.
 inline void apply_assignments(Settings& settings, const std::vector<std::string>& assignments) {
@@ -326,16 +358,26 @@ inline void apply_assignments(Settings& settings, const std::vector<std::string>
     }
 }
 
+// Whether what stands in a task's place is the path of own data: it says so by its name or by what it holds.
+inline bool is_data_file(const std::string& task) {
+    const std::filesystem::path path = task;
+    const bool named = path.extension() == ".hdf5" || path.extension() == ".h5";
+    return !contains(split(task_names, '|'), full_task_name(task)) && (named || std::filesystem::exists(path));
+}
+
 // The settings of one run but for its seed, for the options that train and import share. Errors: usage.*,
 // dataset.missing.
 inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method) {
-    Settings settings = default_settings(task, method, arguments["--preset"]);
-    if (settings.task != "gridworld") {
+    const bool own = is_data_file(task);
+    Settings settings = default_settings(own ? own_data : task, method, arguments["--preset"]);
+    if (find_mujoco_task(settings.task)) {
         settings.mujoco = mujoco_version();
         choose_data_set(settings, arguments["--dataset"]);
     } else if (arguments.has("--dataset")) {
-        fail("usage.option", "the grid world makes its own data set; leave --dataset out");
+        fail("usage.option", own ? "two data sets are given; to train on one of them for a task, name the task first"
+                                 : "the grid world makes its own data set; leave --dataset out");
     }
+    if (own) choose_own_data(settings, task);
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
@@ -347,13 +389,15 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
 inline Settings evaluated_settings(const Arguments& arguments, const TensorFile& file) {
     Settings settings = settings_in(file);
     if (arguments.has("--record")) require_other_file(arguments["--record"], file.path);
-    if (settings.task != "gridworld") settings.mujoco = mujoco_version();  // of the library that steps the bodies here
+    if (find_mujoco_task(settings.task))
+        settings.mujoco = mujoco_version();  // of the library that steps the bodies here
     if (arguments.has("--episodes"))
         settings.eval_episodes = whole_number(arguments["--episodes"], "--episodes", 1, 10000);
     if (arguments.has("--seed")) settings.seed = whole_number(arguments["--seed"], "--seed", 0, 4294967295);
     for (const std::string& assignment : arguments.assignments)
         if (!assignment.starts_with("g_eval=") && !assignment.starts_with("eval_context="))
-            fail("usage.setting", "eval takes --set g_eval=X and --set eval_context=N; \"%s\" is the model's own",
+            fail("usage.setting",
+                 "eval and act take --set g_eval=X and --set eval_context=N; \"%s\" is the model's own",
                  assignment.c_str());
     apply_assignments(settings, arguments.assignments);
     return settings;
@@ -377,10 +421,15 @@ inline std::string method_label(const std::string& method) {
     return method == "dt" ? "DT" : method == "odt" ? "ODT" : "WODTEM";
 }
 
+// The task; of own data the file's name, without the ending.
+inline std::string data_name(const Settings& settings) {
+    return settings.task == own_data ? std::filesystem::path(settings.dataset).stem().string() : settings.task;
+}
+
 // --out, or runs/TASK-PRESET-METHOD-SEED; several runs in one --out have folders of their own below it.
 inline std::string folder_of(const Arguments& arguments, const Settings& settings) {
     if (!arguments.has("--out"))
-        return "runs/" + settings.task + "-" + settings.preset + "-" + settings.method + "-" +
+        return "runs/" + data_name(settings) + "-" + settings.preset + "-" + settings.method + "-" +
                std::to_string(settings.seed);
     return arguments["--out"] + (arguments.has("--methods") ? "/" + settings.method : "") +
            (arguments.has("--seeds") ? "/seed-" + std::to_string(settings.seed) : "");
@@ -412,7 +461,7 @@ inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
 
 inline void announce(const PlannedRun& run) {
     std::fprintf(stderr, "%s: trains on %s, preset %s, in %s; all its settings: %s/settings\n", run.label.c_str(),
-                 run.settings.task.c_str(), run.settings.preset.c_str(), run.folder.c_str(), run.folder.c_str());
+                 data_name(run.settings).c_str(), run.settings.preset.c_str(), run.folder.c_str(), run.folder.c_str());
 }
 
 // One for each method of a sweep, all checked but for the data set, which its machine must have. Errors: usage.*.
@@ -420,7 +469,8 @@ inline std::vector<Settings> swept_settings(const Arguments& arguments) {
     std::vector<Settings> sweep;
     for (const std::string& method : split(arguments["--methods"], ',')) {
         const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
-        sweep.push_back(default_settings(task, method, arguments["--preset"]));
+        sweep.push_back(default_settings(is_data_file(task) ? own_data : task, method, arguments["--preset"]));
+        if (is_data_file(task)) choose_own_data(sweep.back(), task);
         apply_assignments(sweep.back(), arguments.assignments);
         check_together(sweep.back());
     }
@@ -431,6 +481,7 @@ inline std::vector<Settings> swept_settings(const Arguments& arguments) {
 inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arguments, double seconds) {
     const bool estimate = arguments.has("--estimate");
     const std::vector<int64_t> seeds = seed_list(arguments["--seeds"]);
+    const std::string file = arguments.words.empty() ? "" : shell_word(arguments.words[0]);
     std::string shared;
     for (const auto& [option, usual] : {std::pair("--dataset", ""), {"--kernel", "auto"}, {"--precision", "fp32"}})
         if (arguments[option] != usual) shared += std::string(" ") + option + " " + shell_word(arguments[option]);
@@ -438,8 +489,8 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
     for (const Settings& settings : sweep)
         for (const int64_t seed : seeds)
             std::printf("%s./wodtem train %s --method %s --preset %s --seed %lld%s\n", estimate ? "# " : "",
-                        settings.task.c_str(), settings.method.c_str(), settings.preset.c_str(),
-                        static_cast<long long>(seed), shared.c_str());
+                        settings.task == own_data ? file.c_str() : settings.task.c_str(), settings.method.c_str(),
+                        settings.preset.c_str(), static_cast<long long>(seed), shared.c_str());
     if (estimate)
         std::printf("# about %.1f hours on this machine, one after the other; what is interrupted continues\n",
                     seconds * static_cast<double>(seeds.size()) / 3600);

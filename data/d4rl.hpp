@@ -104,6 +104,7 @@ struct Rows {
     std::vector<float> observations, next_observations;  // [count, state_dim]; the second may be empty
     std::vector<float> actions, rewards;                 // [count, action_dim], [count]
     std::vector<uint8_t> terminals, timeouts;            // [count]; timeouts may be empty
+    bool integer_actions = false;                        // by their type in the file
 
     const float* observation(size_t row) const { return &observations[row * state_dim]; }
     bool ends(size_t row) const { return terminals[row] != 0 || (!timeouts.empty() && timeouts[row] != 0); }
@@ -138,6 +139,10 @@ inline const Hdf5Dataset& column_of(const Hdf5File& file, const std::string& nam
     return table_of(file, name, rows, 1).data;
 }
 
+inline bool is_integer(const Hdf5Dataset& data) {
+    return data.element.kind == Hdf5Element::signed_integer || data.element.kind == Hdf5Element::unsigned_integer;
+}
+
 // Refuses a column that is neither D4RL's nor d3rlpy's: it may mark the ends of episodes. Errors: dataset.column.
 inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std::string& ends) {
     for (const std::string& name : file.names()) {
@@ -161,6 +166,7 @@ inline Rows read_rows(const Hdf5File& file) {
     require(!empty, "dataset.shape", file.path, ": holds no steps");
     rows.observations = file.read<float>(states.data);
     rows.actions = file.read<float>(actions.data);
+    rows.integer_actions = is_integer(actions.data);
     rows.rewards = file.read<float>(column_of(file, "rewards", rows.count));
     rows.terminals = file.read_flags(column_of(file, "terminals", rows.count));
     const bool of_d3rlpy = file.find("episode_terminals") && !file.find("timeouts");
@@ -214,6 +220,7 @@ inline Rows read_minari(const Hdf5File& file) {
         const Hdf5Table states = table_of(file, group + "observations", steps + 1);
         if (rows.count == 0) rows.state_dim = states.columns;
         if (rows.count == 0) rows.action_dim = actions.columns;
+        if (rows.count == 0) rows.integer_actions = is_integer(actions.data);
         const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
         const bool alike = states.columns == rows.state_dim && actions.columns == rows.action_dim;
         require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
@@ -336,7 +343,7 @@ inline std::vector<Trajectory> cut_trajectories(const Rows& rows, const MujocoTa
 
 // Requires what a learner needs: finite numbers, and actions in [-1, 1], which published ones may leave by a rounding
 // error. Errors: dataset.not_finite, dataset.action with the row and the column.
-inline void require_sound(const Rows& rows, const std::string& path) {
+inline void require_sound(const Rows& rows, const std::string& path, float largest_action = 1 + 1e-5f) {
     const auto require_all = [&](const char* name, const std::vector<float>& values, size_t width, float bound) {
         for (size_t i = 0; i < values.size(); ++i) {
             if (std::fabs(values[i]) <= bound) continue;  // never so for NaN
@@ -350,7 +357,7 @@ inline void require_sound(const Rows& rows, const std::string& path) {
     };
     constexpr float any = std::numeric_limits<float>::max();
     require_all("observations", rows.observations, rows.state_dim, any);
-    require_all("actions", rows.actions, rows.action_dim, 1 + 1e-5f);
+    require_all("actions", rows.actions, rows.action_dim, largest_action);
     require_all("rewards", rows.rewards, 1, any);
 }
 
@@ -363,6 +370,58 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
     return trajectories;
+}
+
+// Data of no task of this program: states and actions of any sizes.
+struct OwnData {
+    EnvironmentSpec spec;  // its time limit is not used
+    std::vector<Trajectory> trajectories;
+};
+
+// How many moves there are to choose from: one more than the greatest action, where actions are one whole number each and
+// either of an integer type or above 1, which a continuous action cannot be; else 0. Errors: dataset.action.
+inline int number_of_moves(const Rows& rows, const std::string& path) {
+    const auto whole = [](float x) { return x == std::floor(x); };
+    if (rows.action_dim != 1 || !std::ranges::all_of(rows.actions, whole)) return 0;
+    const auto [least, most] = std::ranges::minmax(rows.actions);
+    if (!rows.integer_actions && most <= 1) return 0;
+    require(least >= 0 && most < 10000, "dataset.action", path, ": \"actions\" are whole numbers from ", least, " to ",
+            most, "; moves are numbered from 0, up to 9999");
+    return static_cast<int>(most) + 1;
+}
+
+// Flags alone end trajectories, since no time limit is known. Errors: dataset.*, hdf5.*, file.*.
+inline OwnData load_own_data(const std::string& path) {
+    const Rows rows = read_data_set(path);
+    const int moves = number_of_moves(rows, path);
+    require_sound(rows, path, moves > 0 ? 10000.0f : 1 + 1e-5f);
+    const int sizes_limit = 100000;
+    require(rows.state_dim <= sizes_limit && rows.action_dim <= sizes_limit, "dataset.shape", path, ": has ",
+            rows.state_dim, " state and ", rows.action_dim, " action numbers a step; the most is ", sizes_limit);
+    OwnData data{{static_cast<int>(rows.state_dim), static_cast<int>(rows.action_dim), moves, 1},
+                 cut_at_flags(rows, std::numeric_limits<size_t>::max())};
+    require(!data.trajectories.empty(), "dataset.empty", path,
+            ": no step is marked as the end of a trajectory in terminals or timeouts, so there is none");
+    return data;
+}
+
+// Of trajectories in the order of the file, evenly spaced ones are held out, so that they are a `share` of all.
+inline bool is_held_out(size_t trajectory, double share) {
+    const double i = static_cast<double>(trajectory);
+    return std::floor((i + 1) * share) > std::floor(i * share);
+}
+
+// The trajectories of own data that are held out, or those that are not (the first is not), with their returns.
+// Errors: those of load_own_data().
+inline std::vector<Trajectory> part_of_own_data(const Settings& settings, bool held_out) {
+    OwnData data = load_own_data(settings.dataset_path);
+    std::vector<Trajectory> part;
+    for (size_t i = 0; i < data.trajectories.size(); ++i) {
+        if (is_held_out(i, settings.held_out) != held_out) continue;
+        relabel(data.trajectories[i], data.spec.state_dim, data.spec.action_dim, settings.gamma);
+        part.push_back(std::move(data.trajectories[i]));
+    }
+    return part;
 }
 
 // Writes the first `steps` rows of all arrays under their names in D4RL's files. Errors: file.write.
@@ -396,7 +455,9 @@ inline void write_episodes(const std::string& path, const std::vector<Episode>& 
 }
 
 // The offline data of a run with their returns: the grid world's behaviour policy, a file, or uniformly random actions.
+// Of own data what is not held out.
 inline std::vector<Trajectory> make_data_set(const Settings& settings) {
+    if (settings.task == own_data) return part_of_own_data(settings, false);
     std::vector<Trajectory> trajectories;
     const std::unique_ptr<Environment> environment = make_environment(settings);
     const uint32_t seed = static_cast<uint32_t>(settings.data_seed);

@@ -8,6 +8,8 @@
 //   model.safetensors        the trained model (model_file.hpp)
 //   policy.csv, start_actions.csv (grid world), paths.csv (mazes): what the report's figures need
 //   finished                 empty; written last
+//   kept.safetensors         with --keep-state: the state before the last evaluation, from which a larger budget goes on
+//   budgets                  the smaller budgets of a run that went on, a line each
 //
 // Promises: the checkpoint notes the length and the checksum of both logs, and continuing cuts them back to it, so an
 // interrupted run ends with the same bytes; a folder of other settings is left as it is; one process at a time works in
@@ -28,6 +30,7 @@ inline constexpr const char* progress_header =
     "phase,updates,interactions,episodes,learning_rate,loss,entropy,lambda,gradient_norm,short,unmatched,memory,"
     "eval_length,eval_return,eval_score,rollout_length,rollout_return,matched,evicted,dropped,"
     "advice,advice_distance,advice_shift,physics\n";
+inline constexpr const char* held_out_header = "held_out_log_prob,held_out_error\n";  // further columns of own data
 inline constexpr const char* episodes_header = "episode,interactions,length,return,terminated,actions,physics\n";
 
 // Sums since the latest row of progress.csv.
@@ -98,6 +101,7 @@ struct ProgressRow {
     size_t memory_size;
     double eval_length, eval_return, eval_score;
     Tally tally;
+    double held_out_log_prob = NAN, held_out_error = NAN;  // of own data
 };
 
 struct EpisodeRow {
@@ -116,6 +120,7 @@ inline std::string csv_line(const auto&... fields) {
 
 // The last column: which simulation the numbers belong to.
 inline std::string physics_text(const Settings& settings) {
+    if (settings.task == own_data) return "own data";
     return settings.task == "gridworld" ? "grid world" : settings.physics + " on MuJoCo " + settings.mujoco;
 }
 
@@ -132,15 +137,23 @@ inline std::string progress_line(const ProgressRow& row, const Settings& setting
     };
     const bool has_entropy = settings.method != "dt";
     const double advised_updates = settings.method == "wodtem" ? t.updates : 0;
-    const double shift = length_of_shift(t.advice_shift, settings.task == "gridworld");
-    return csv_line(row.online ? "online" : "offline", row.updates, row.interactions, row.episodes, row.learning_rate,
-                    mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0),
-                    has_entropy ? static_cast<float>(row.lambda) : NAN, mean(t.gradient_norm, t.updates),
-                    mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs), row.memory_size, row.eval_length,
-                    row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
-                    mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped,
-                    mean(t.advice, advised_updates), mean(t.advice_distance, advised_updates),
-                    mean(shift, advised_updates), physics_text(settings));
+    const double shift = length_of_shift(t.advice_shift, spec_of(settings).discrete_actions > 0);
+    std::string line =
+        csv_line(row.online ? "online" : "offline", row.updates, row.interactions, row.episodes, row.learning_rate,
+                 mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0),
+                 has_entropy ? static_cast<float>(row.lambda) : NAN, mean(t.gradient_norm, t.updates),
+                 mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs), row.memory_size, row.eval_length,
+                 row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
+                 mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped, mean(t.advice, advised_updates),
+                 mean(t.advice_distance, advised_updates), mean(shift, advised_updates), physics_text(settings));
+    if (settings.task != own_data) return line;
+    line.back() = ',';
+    return line + csv_line(static_cast<float>(row.held_out_log_prob), static_cast<float>(row.held_out_error));
+}
+
+inline std::string progress_header_of(const Settings& settings) {
+    const std::string header = progress_header;
+    return settings.task == own_data ? header.substr(0, header.size() - 1) + "," + held_out_header : header;
 }
 
 // What is said of a run whose folder holds a part of it already, and of a run that is finished.
@@ -224,7 +237,7 @@ struct Log {
         bytes += line.size();
         crc = crc32(line, static_cast<uint32_t>(crc));
     }
-    void begin(const char* header) {
+    void begin(const std::string& header) {
         write_file_atomic(path, "");
         bytes = crc = 0;
         append(header);
@@ -246,8 +259,8 @@ struct RunFolder {
     std::string file(const char* name) const { return path + "/" + name; }
     bool has(const char* name) const { return std::filesystem::exists(file(name)); }
 
-    void begin_logs() {
-        progress.begin(progress_header);
+    void begin_logs(const Settings& settings) {
+        progress.begin(progress_header_of(settings));
         episodes.begin(episodes_header);
     }
     void sync_logs() const {
@@ -282,18 +295,37 @@ struct FolderLock : File {
     }
 };
 
-// A folder, which must be locked, may be new, hold this very run, or hold another run, which is then left as it is.
-// Errors: run.folder, run.other_settings.
+// A run that was stopped, or that kept its state, goes on with larger budgets: its state becomes a checkpoint, and its
+// model, which the state contains, goes away. Errors: run.not_kept.
+inline void go_on(const RunFolder& folder, const Settings& begun, const Settings& settings) {
+    const bool kept = folder.has("kept.safetensors"), has_state = kept || folder.has("checkpoint.safetensors");
+    require(has_state || !folder.has("finished"), "run.not_kept", folder.path,
+            " is finished and has not kept its state; train with --keep-state to go on with a larger budget later");
+    if (kept) std::filesystem::rename(folder.file("kept.safetensors"), folder.file("checkpoint.safetensors"));
+    for (const char* name : {"finished", "model.safetensors"}) std::filesystem::remove(folder.file(name));
+    AppendFile(folder.file("budgets"))
+        .write("offline_updates = " + number_text(begun.offline_updates) +
+               ", online_steps = " + number_text(begun.online_steps) + "\n");
+    write_file_atomic(folder.file("settings"), settings_text(settings));
+}
+
+// A folder, which must be locked, may be new, hold this very run, perhaps with smaller budgets, or hold another run,
+// which is then left as it is. Errors: run.folder, run.other_settings, run.not_kept.
 inline void claim_folder(const RunFolder& folder, const Settings& settings) {
     remove_temporaries(folder.path);
     const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors");
     require(folder.has("settings") || !has_run, "run.folder", folder.path,
             " holds a run without its settings file; choose another folder with --out");
     const std::string path = folder.file("settings");
-    if (folder.has("settings") && (has_run || folder.has("finished")))
-        require_same_settings(settings_from_text(read_file(path, 1 << 20), path), settings, folder.path);
-    else
+    if (folder.has("settings") && (has_run || folder.has("finished"))) {
+        const Settings begun = settings_from_text(read_file(path, 1 << 20), path);
+        const Settings larger = with_larger_budgets(begun, settings);
+        require_same_settings(larger, settings, folder.path);
+        if (larger.online_steps != begun.online_steps || larger.offline_updates != begun.offline_updates)
+            go_on(folder, begun, settings);
+    } else {
         write_file_atomic(path, settings_text(settings));  // a start that failed may have left other settings
+    }
     if (!folder.has("finished")) write_file_atomic(folder.file("command"), train_command(settings) + "\n");
 }
 
@@ -320,7 +352,8 @@ inline void load_state(RunFolder& folder, const Settings& settings, auto&& visit
         const TensorFile file = read_own_safetensors(path);
         const bool checkpoint = file.text("format") == checkpoint_format;
         require(checkpoint, "checkpoint.format", "it is no checkpoint of this version of `wodtem train`");
-        require_same_settings(settings_from_text(file.text("settings"), path), settings, path);
+        const Settings begun = settings_from_text(file.text("settings"), path);
+        require_same_settings(with_larger_budgets(begun, settings), settings, path);
         Loader loader{file};
         folder.visit(loader);
         visit(loader);
@@ -353,14 +386,19 @@ struct CheckpointTimer {
     }
 };
 
-inline void remove_checkpoint(const RunFolder& folder) {
-    std::filesystem::remove(folder.file("checkpoint.safetensors"));
+// Of a finished run: the checkpoint goes, or becomes the state from which the run can go on.
+inline void retire_checkpoint(const RunFolder& folder, bool keep) {
+    if (!folder.has("checkpoint.safetensors")) return;
+    if (keep)
+        std::filesystem::rename(folder.file("checkpoint.safetensors"), folder.file("kept.safetensors"));
+    else
+        std::filesystem::remove(folder.file("checkpoint.safetensors"));
 }
 
-// Says so if the run is finished, and removes a checkpoint that a kill has left beside the model.
-inline bool is_finished_already(const RunFolder& folder) {
+// Says so if the run is finished, and retires a checkpoint that a kill has left beside the model.
+inline bool is_finished_already(const RunFolder& folder, bool keep) {
     if (!folder.has("finished")) return false;
-    remove_checkpoint(folder);
+    retire_checkpoint(folder, keep);
     std::printf("%s is finished already\n", folder.path.c_str());
     return true;
 }

@@ -140,6 +140,7 @@ struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
     std::string physics = "none", mujoco = "none", dataset = "none", dataset_sha256 = "none", first_weights = "none";
     int64_t seed = 0;
+    int64_t state_dim = 0, action_dim = 0, moves = 0;  // of own data alone
 
     int64_t layers = 1, heads = 1, width = 512, context_length = 1, eval_context = 5;
     bool position = false;
@@ -156,6 +157,7 @@ struct Settings {
     double g_online = 2, g_eval = 1, reward_scale = 1;
     bool keep_lowest = false;
     std::string sampling = "uniform", cut = "flags";
+    double held_out = 0;
 
     double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
     int64_t K = 1, projected_dim = 0, table_size = 36;
@@ -183,7 +185,8 @@ constexpr const char* task_names =
     "gridworld|hopper-medium-v2|hopper-medium-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|"
     "halfcheetah-medium-v2|halfcheetah-medium-replay-v2|ant-medium-v2|ant-medium-replay-v2|antmaze-umaze-v2|"
     "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|walker2d-v2|halfcheetah-v2|"
-    "ant-v2";
+    "ant-v2|data";
+constexpr const char* own_data = "data";  // the task of a data set that belongs to none of the others
 constexpr double many = 1e9;
 // WODTEM Table I: each row is the source of a value below.
 inline const SettingRow setting_rows[] = {
@@ -198,6 +201,9 @@ inline const SettingRow setting_rows[] = {
     {"dataset", &Settings::dataset, 0, 0, "", "made on the spot"},
     {"dataset_sha256", &Settings::dataset_sha256, 0, 0, "", "of the file"},
     {"first_weights", &Settings::first_weights, 0, 0, "", "none: drawn from the seed"},
+    {"state_dim", &Settings::state_dim, 0, 1e5, "", "the task's own: 0 stands for it"},
+    {"action_dim", &Settings::action_dim, 0, 1e5, "", "the task's own: 0 stands for it"},
+    {"moves", &Settings::moves, 0, 1e4, "", "the task's own: 0 stands for it"},
     // The network.
     {"layers", &Settings::layers, 1, 1000, "", "WODTEM Table I: number of layers"},
     {"heads", &Settings::heads, 1, 1000, "", "WODTEM Table I: number of attention heads"},
@@ -235,6 +241,7 @@ inline const SettingRow setting_rows[] = {
      "chosen: so ODT ends near the paper's 7; DT's and ODT's code: by_length"},
     {"cut", &Settings::cut, 0, 0, "flags|episodes",
      "D4RL's and ODT's code; episodes (maze2d): at the time limit alone"},
+    {"held_out", &Settings::held_out, 0, 0.9, "", "the paper trains on all trajectories"},
     // Episodic memory.
     {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
     {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},
@@ -310,6 +317,8 @@ inline const TaskRow task_rows[] = {
      "batch_size=64 offline_updates=100000",
      "DT's code"},
     {"maze2d", "dt", "reward_scale=1", "chosen: as others' DT on maze2d"},
+    {"data", "", "physics=none", "there is no environment"},
+    {"data", "", "held_out=0.1", "chosen: for measuring, since nothing can be evaluated by acting"},
 };
 
 // Preset small: what it changes of preset paper, so that a run takes half an hour on two cores. All three methods share
@@ -411,6 +420,7 @@ inline Settings default_settings(const std::string& task, const std::string& met
     if (preset == "reduced" && gridworld)
         fail("usage.setting", "preset reduced is for MuJoCo's tasks; the grid world has small and paper");
     if (preset == "reduced") apply(reduced_rows);
+    if (settings.task == own_data) set_from(settings, "online_steps", "0", "there is no environment");
     if (method == "dt") {
         set_from(settings, "online_steps", "0", "DT learns offline only");
         for (const char* name : {"layers", "heads", "width", "context_length", "learning_rate", "weight_decay",
@@ -436,10 +446,16 @@ inline void check_together(const Settings& settings) {
              settings.task.c_str());
     if (online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
-    const bool gridworld = settings.task == "gridworld";
-    if (gridworld != (settings.physics == "none"))
+    const bool gridworld = settings.task == "gridworld", own = settings.task == own_data;
+    if (own && (settings.state_dim == 0 || settings.action_dim == 0 || (settings.moves > 0 && settings.action_dim > 1)))
+        fail("usage.setting", "the task data is chosen by giving a file: wodtem train FILE.hdf5");
+    if (own && online_steps > 0)
+        fail("usage.setting", "online_steps must be 0, not %lld: own data have no environment", online_steps);
+    if (!own && settings.held_out > 0)
+        fail("usage.setting", "held_out is for own data; others are evaluated by acting");
+    if ((gridworld || own) != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
-             gridworld ? "a table of moves: none" : "d4rl or 2.2");
+             gridworld || own ? "none: there are no bodies" : "d4rl or 2.2");
     if (gridworld == (settings.behaviour == "random" || settings.behaviour == "recorded"))
         fail("usage.setting", "%s cannot have behaviour %s; it is %s", settings.task.c_str(),
              settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "recorded or random");
@@ -540,6 +556,14 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
     return settings;
 }
 
+// The settings of a run that is to go on with larger budgets, which have no other effect on what came before: more
+// interactions, or more offline updates of a run that has no online phase yet.
+inline Settings with_larger_budgets(Settings found, const Settings& wanted) {
+    if (found.online_steps == 0) found.offline_updates = std::max(found.offline_updates, wanted.offline_updates);
+    found.online_steps = std::max(found.online_steps, wanted.online_steps);
+    return found;
+}
+
 // `where`: the file or folder that `found` was read from. Errors: run.other_settings.
 inline void require_same_settings(const Settings& found, const Settings& wanted, const std::string& where) {
     for (const SettingRow& row : setting_rows) {
@@ -558,22 +582,23 @@ inline void require_same_settings(const Settings& found, const Settings& wanted,
 // then the data set's file name and the checksum of the model stand in their places. The fused arithmetic needs no
 // option: its kernels are the default where a machine has them.
 inline std::string train_command(const Settings& settings) {
-    std::string command = "./wodtem train " + settings.task;
+    const bool own = settings.task == own_data;
+    const std::string file =
+        settings.dataset_path.empty() ? settings.dataset : std::filesystem::absolute(settings.dataset_path).string();
+    std::string command = "./wodtem train " + (own ? shell_word(file) : settings.task);
     const auto add = [&](const char* option, const std::string& value) {
         command += std::string(" ") + option + " " + shell_word(value);
-    };
-    const auto add_path = [&](const char* option, const std::string& path, const std::string& otherwise) {
-        add(option, path.empty() ? otherwise : std::filesystem::absolute(path).string());
     };
     add("--method", settings.method);
     add("--preset", settings.preset);
     add("--seed", std::to_string(settings.seed));
-    if (settings.task != "gridworld") {
-        add_path("--dataset", settings.dataset_path, settings.dataset == "none" ? "random" : settings.dataset);
+    if (settings.physics != "none") {
+        add("--dataset", file == "none" ? "random" : file);
         add("--physics", settings.physics);
     }
     if (settings.first_weights != "none")
-        add_path("--weights", settings.weights_path, "model-of-sha256-" + settings.first_weights);
+        add("--weights", settings.weights_path.empty() ? "model-of-sha256-" + settings.first_weights
+                                                       : std::filesystem::absolute(settings.weights_path).string());
     if (settings.arithmetic == "plain") add("--kernel", "portable");
     if (settings.arithmetic == "bf16") add("--precision", "bf16");
     const std::set<std::string> written{"task", "method", "preset", "seed", "arithmetic", "physics"};
@@ -628,9 +653,31 @@ inline GridWorld make_grid_world(const Settings& settings) {
     return world;
 }
 
+// What stands in the place of an environment for own data. Errors of acting in it: data.environment.
+struct NoEnvironment : Environment {
+    EnvironmentSpec sizes;
+    explicit NoEnvironment(const EnvironmentSpec& of_data) : sizes(of_data) {}
+    EnvironmentSpec spec() const override { return sizes; }
+    void reset(const Random&, uint64_t, float*) override {
+        fail("data.environment", "own data have no environment to evaluate in; `wodtem act` gives a model's actions");
+    }
+    Step step(const float*, float*) override { return {0, true}; }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<NoEnvironment>(*this); }
+};
+
+inline EnvironmentSpec spec_of(const Settings& settings) {
+    if (settings.task == "gridworld") return make_grid_world(settings).spec();
+    if (settings.task == own_data)
+        return {static_cast<int>(settings.state_dim), static_cast<int>(settings.action_dim),
+                static_cast<int>(settings.moves), 1};
+    const MujocoTask& task = *find_mujoco_task(settings.task);
+    return {task.state_dim, task.action_dim, 0, task.max_episode_steps};
+}
+
 // Errors: mujoco.absent in a program that was built without the library.
 inline std::unique_ptr<Environment> make_environment(const Settings& settings) {
     if (settings.task == "gridworld") return make_grid_world(settings).clone();
+    if (settings.task == own_data) return std::make_unique<NoEnvironment>(spec_of(settings));
 #ifdef WODTEM_MUJOCO
     const int physics = index_of(physics_names, settings.physics);
     return std::make_unique<MujocoEnvironment>(*find_mujoco_task(settings.task), static_cast<Physics>(physics));
@@ -638,12 +685,6 @@ inline std::unique_ptr<Environment> make_environment(const Settings& settings) {
     fail("mujoco.absent", "%s needs MuJoCo 2.2, which was not there when this program was built; %s",
          settings.task.c_str(), mujoco_advice);
 #endif
-}
-
-inline EnvironmentSpec spec_of(const Settings& settings) {
-    if (settings.task == "gridworld") return make_grid_world(settings).spec();
-    const MujocoTask& task = *find_mujoco_task(settings.task);
-    return {task.state_dim, task.action_dim, 0, task.max_episode_steps};
 }
 
 // The score of a return: D4RL's normalised score, and on the grid world the return itself.

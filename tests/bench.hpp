@@ -585,6 +585,18 @@ void bench_random_policy(int threads) {
 
 #endif
 
+// Seconds that a run takes here: the mean time of three updates, after one that allocates, times all updates expected.
+double estimated_seconds(Settings settings, const Kernel& kernel) {
+    if (settings.task != "gridworld") settings.behaviour = "random";
+    Compute compute(kernel, default_threads(settings));
+    Run run(compute, settings, *make_environment(settings));
+    begin_run(run, make_data_set(settings));
+    update(run);
+    const Clock::time_point begin = Clock::now();
+    for (int i = 0; i < 3; ++i) update(run);
+    return seconds_since(begin) / 3 * expected_updates(settings);
+}
+
 void command_bench(const Arguments& arguments) {
     kernel_of(arguments);  // refuses what the machine lacks
     const int threads = thread_count(arguments);

@@ -46,7 +46,7 @@ Settings tiny_settings(const std::string& method, const std::string& alpha = "0.
 
 void quiet_train(
     const Settings& settings, const std::string& folder, int threads = 1, double checkpoint_every = 1e9,
-    const std::function<bool()>& asked_to_stop = [] { return stop_requested != 0; }) {
+    const std::function<bool()>& asked_to_stop = [] { return stop_requested != 0; }, bool keep_state = false) {
     const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
     std::fflush(stdout);
     dup2(null, 1), dup2(null, 2);
@@ -56,6 +56,7 @@ void quiet_train(
               {.kernel = kernel_for(settings.arithmetic),
                .threads = threads,
                .checkpoint_every = checkpoint_every,
+               .keep_state = keep_state,
                .asked_to_stop = asked_to_stop});
     } catch (...) {
         problem = std::current_exception();
@@ -95,7 +96,7 @@ struct Fixture {
     void save(const std::string& path) { save_model(contents_of(run.agent), path); }
     void save_checkpoint(const std::string& path) {
         RunFolder folder{path};
-        folder.begin_logs();
+        folder.begin_logs(run.agent.settings);
         ::save_checkpoint(folder, run.agent.settings, [&](auto& archive) { visit_state(archive, run); });
     }
     void load(const std::string& path) {
@@ -1060,9 +1061,223 @@ TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
                     std::count(rows.timeouts.begin(), rows.timeouts.end(), 1),
                 3);
     check_shell(eval + " --record " + run + "/model.safetensors", 1, "that is read");
-    check_shell(eval + " --set alpha=0.5", 2, "eval takes --set g_eval=X and --set eval_context=N");
+    check_shell(eval + " --set alpha=0.5", 2, "eval and act take --set g_eval=X and --set eval_context=N");
     check_shell(eval + " --set g_eval=x", 2, "g_eval cannot be");
     check_shell(eval + " --seed -1", 2, "nearest is 0");
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Own data, and acting on states from outside
+
+namespace {
+// The grid world's data set as a file of own data.
+std::string grid_file(const Scratch& scratch) {
+    Settings settings = tiny_settings("wodtem");
+    std::vector<Episode> episodes;
+    for (Trajectory& trajectory : make_data_set(settings)) episodes.emplace_back().trajectory = std::move(trajectory);
+    write_episodes(scratch / "own.hdf5", episodes);
+    return scratch / "own.hdf5";
+}
+
+Settings own_settings(const std::string& path, const std::string& method) {
+    Settings settings = default_settings(own_data, method, "small");
+    choose_own_data(settings, path);
+    for (auto [name, value] : std::initializer_list<std::pair<const char*, const char*>>{{"layers", "1"},
+                                                                                         {"width", "16"},
+                                                                                         {"context_length", "3"},
+                                                                                         {"batch_size", "32"},
+                                                                                         {"table_size", "100"},
+                                                                                         {"offline_updates", "40"},
+                                                                                         {"learning_rate", "0.01"},
+                                                                                         {"warmup_updates", "10"}})
+        set_from(settings, name, value, "command line");
+    settings.arithmetic = best_kernel().arithmetic;
+    return settings;
+}
+
+// Continuous data: 6 trajectories of 5 steps, 2 state and 2 action numbers.
+std::string continuous_file(const Scratch& scratch) {
+    std::vector<float> states, actions, rewards;
+    std::vector<uint8_t> terminals;
+    for (int i = 0; i < 30; ++i) {
+        const float x = static_cast<float>(i % 7) / 7;
+        states.insert(states.end(), {x, 1 - x});
+        actions.insert(actions.end(), {x - 0.5f, 0.25f});
+        rewards.push_back(x);
+        terminals.push_back(i % 5 == 4);
+    }
+    Hdf5Writer out(scratch / "continuous.hdf5");
+    out.add("observations", {30, 2}, states);
+    out.add("actions", {30, 2}, actions);
+    out.add("rewards", {30}, rewards);
+    out.add("terminals", {30}, terminals);
+    out.close();
+    return scratch / "continuous.hdf5";
+}
+}  // namespace
+
+TEST(own_data_decide_sizes_returns_and_what_is_held_out) {
+    const Scratch scratch;
+    const Settings grid = own_settings(grid_file(scratch), "wodtem");
+    CHECK(grid.state_dim == 2 && grid.action_dim == 1 && grid.moves == 8 && grid.eta == -1 && grid.g_eval == 1);
+    const Settings continuous = own_settings(continuous_file(scratch), "odt");
+    CHECK(continuous.state_dim == 2 && continuous.action_dim == 2 && continuous.moves == 0 && continuous.eta == -2);
+    // Rewards are the first state number, in sevenths; the fifth trajectory, rows 20 to 24, has 6 0 1 2 3 of them.
+    double best = 0;
+    for (int first = 0; first < 30; first += 5) {
+        double total = 0;
+        for (int i = first; i < first + 5; ++i) total += static_cast<float>(i % 7) / 7;
+        best = std::max(best, total);
+    }
+    CHECK_CLOSE(continuous.g_eval, best, 1e-6);
+    CHECK_EQUAL(continuous.reward_scale, 1.0);
+    // A third of six: the third and the sixth.
+    Settings third = continuous;
+    third.held_out = 1.0 / 3 + 1e-12;
+    const auto first_states = [&](bool held_out) {
+        std::vector<float> states;
+        for (const Trajectory& trajectory : part_of_own_data(third, held_out)) states.push_back(trajectory.states[0]);
+        return states;
+    };
+    const auto state = [](int row) { return static_cast<float>(row % 7) / 7; };
+    CHECK(first_states(true) == (std::vector{state(10), state(25)}));
+    CHECK(first_states(false) == (std::vector{state(0), state(5), state(15), state(20)}));
+    CHECK_FAILS("usage.setting", check_together(default_settings(own_data, "wodtem", "small")));
+    CHECK_FAILS("data.environment", make_environment(grid)->reset({}, 0, nullptr));
+}
+
+// The measurement against its definition: each window by itself, each action by hand.
+TEST(held_out_measurements_are_means_over_steps) {
+    const Scratch scratch;
+    for (const auto& [path, method] :
+         {std::pair(grid_file(scratch), "odt"), {continuous_file(scratch), "odt"}, {continuous_file(scratch), "dt"}}) {
+        const Settings settings = own_settings(path, method);
+        Compute compute(best_kernel(), 1);
+        Run run(compute, settings, *make_environment(settings));
+        begin_run(run, make_data_set(settings));
+        for (int i = 0; i < 3; ++i) update(run);
+        const std::vector<Trajectory> trajectories = part_of_own_data(settings, false);
+        const HeldOut measured = measure(run.agent, run.acting, trajectories);
+        double log_probs = 0, errors = 0, steps = 0;
+        for (const Trajectory& trajectory : trajectories)
+            for (int first = 0; first < trajectory.length(); first += 3) {
+                Batch window;
+                for (int t = first; t < std::min(first + 3, trajectory.length()); ++t)
+                    append_step(window, run.agent, trajectory, t);
+                window.sequences.lengths = {window.sequences.steps()};
+                run.acting.reset();
+                const Policy<float> policy =
+                    forward(run.acting, run.agent.model, window.sequences, Queries::every_state);
+                const int A = run.agent.spec.action_dim, columns = policy.output.columns;
+                for (int i = 0; i < window.sequences.steps(); ++i, ++steps) {
+                    const float* output = policy.output.value + i * columns;
+                    for (int j = 0; j < A && settings.moves == 0; ++j) {
+                        const double a = window.actions[i * A + j], mean = output[j];
+                        const bool dt = std::string(method) == "dt";
+                        const double error = std::pow((dt ? mean : std::tanh(mean)) - a, 2) / A;
+                        errors += error;
+                        const double deviation = dt ? 1 : std::exp(double{policy.log_std.value[i * columns + j]});
+                        const double z = (std::atanh(a) - mean) / deviation;
+                        log_probs +=
+                            dt ? -error
+                               : -z * z / 2 - std::log(deviation) - std::log(2 * M_PI) / 2 - std::log(1 - a * a);
+                    }
+                    if (settings.moves == 0) continue;
+                    const int move = static_cast<int>(window.actions[i]);
+                    log_probs += output[move];
+                    errors += move != std::max_element(output, output + columns) - output;
+                }
+            }
+        CHECK_CLOSE(measured.log_prob, log_probs / steps, 1e-6 * std::fabs(log_probs / steps) + 1e-5);
+        CHECK_CLOSE(measured.error, errors / steps, 1e-5);
+    }
+    Fixture f(tiny_settings("odt"));
+    CHECK(std::isnan(measure(f.run.agent, f.run.acting, {}).log_prob));
+}
+
+TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
+    const Scratch scratch;
+    const Settings settings = own_settings(grid_file(scratch), "wodtem");
+    quiet_train(settings, scratch / "whole");
+    const Table progress = results::Log(scratch / "whole/progress.csv").table;
+    CHECK_EQUAL(progress.rows.size(), 11u);  // before the first update, and after each tenth
+    const size_t column = progress.header.size() - 2;
+    CHECK_EQUAL(progress.header[column], "held_out_log_prob");
+    CHECK(*to_number(progress.rows.back()[column]) > *to_number(progress.rows.front()[column]));
+    CHECK(*to_number(progress.rows.back()[9]) > 0);  // some steps fall short of the memory
+    train_until(settings, scratch / "parts", 40);
+    quiet_train(settings, scratch / "parts");
+    for (const char* name : {"progress.csv", "model.safetensors"})
+        CHECK(read_file(scratch / "whole/" + name) == read_file(scratch / "parts/" + name));
+    const std::string command = read_file(scratch / "whole/command");
+    check_shell(command.substr(0, command.size() - 1) + " --out " + scratch / "again", 0, "trajectories held out");
+    CHECK(read_file(scratch / "whole/model.safetensors") == read_file(scratch / "again/model.safetensors"));
+    check_shell("./wodtem eval " + scratch / "whole", 1, "own data have no environment");
+    check_shell("./wodtem train data", 2, "wodtem train FILE.hdf5");
+    check_shell("./wodtem train " + scratch / "none.hdf5", 1, "none.hdf5");
+    check_shell("./wodtem train " + settings.dataset_path + " --set online_steps=5", 2, "must be 0");
+    check_shell("./wodtem sweep " + settings.dataset_path + " --seeds 3", 0, "own.hdf5 --method wodtem --preset small");
+}
+
+// A run that kept its state and goes on with a larger budget ends as one that had that budget from the start.
+TEST(a_larger_budget_goes_on_to_the_bytes_of_a_run_that_had_it_from_the_start) {
+    const Scratch scratch;
+    for (const char* method : {"dt", "odt", "wodtem"}) {
+        const std::string whole = scratch / method, parts = whole + "-parts";
+        const Settings smaller = tiny_settings(method);
+        Settings larger = smaller;
+        if (std::string(method) == "dt")
+            larger.offline_updates = 70;
+        else
+            larger.online_steps = 700;
+        quiet_train(larger, whole);
+        quiet_train(smaller, parts);
+        CHECK_FAILS("run.not_kept", quiet_train(larger, parts));
+        CHECK(fs::exists(parts + "/finished") && fs::exists(parts + "/model.safetensors"));
+        fs::remove_all(parts);
+        quiet_train(
+            smaller, parts, 1, 1e9, [] { return false; }, true);
+        const std::string model = read_file(parts + "/model.safetensors");
+        quiet_train(
+            smaller, parts, 1, 1e9, [] { return false; }, true);  // is finished already
+        CHECK(read_file(parts + "/model.safetensors") == model && fs::exists(parts + "/kept.safetensors"));
+        train_until(larger, parts, 60);  // and is stopped on the way
+        CHECK(!fs::exists(parts + "/finished") && !fs::exists(parts + "/model.safetensors"));
+        CHECK_FAILS("run.other_settings", quiet_train(smaller, parts));
+        quiet_train(larger, parts);
+        check_same_results(whole, parts);
+        CHECK_EQUAL(read_file(parts + "/budgets"),
+                    "offline_updates = 40, online_steps = " + std::to_string(smaller.online_steps) + "\n");
+        CHECK(!fs::exists(parts + "/kept.safetensors") && !fs::exists(parts + "/checkpoint.safetensors"));
+    }
+}
+
+// What `act` answers to the states and returns-to-go of an evaluation is what was done there.
+TEST(act_answers_with_the_actions_of_an_evaluation) {
+    const Scratch scratch;
+    Settings settings = tiny_settings("odt");
+    set_setting(settings, "context_length", "4");
+    quiet_train(settings, scratch / "run");
+    check_shell("./wodtem eval " + scratch / "run --episodes 2 --record " + scratch / "made.hdf5", 0, "2 episodes");
+    const Rows rows = read_data_set(scratch / "made.hdf5");
+    std::string states, expected;
+    float wanted = 1;  // g_eval, less each reward
+    for (size_t row = 0; row < rows.count; ++row) {
+        states += number_text(wanted) + ", " + number_text(rows.observations[2 * row]) + "," +
+                  number_text(rows.observations[2 * row + 1]) + "\r\n";
+        expected += number_text(rows.actions[row]) + "\n";
+        wanted = rows.ends(row) ? 1 : wanted - rows.rewards[row];
+        if (rows.ends(row)) states += "\n";
+    }
+    write_file_atomic(scratch / "states", states);
+    const std::string act = "./wodtem act " + scratch / "run ";
+    CHECK_EQUAL(shell(act + scratch / "states").text, expected);
+    CHECK_EQUAL(shell(act + "< " + scratch / "states").text, expected);
+    check_shell("echo 1,2,3,4 | " + act, 1, "line 1 of the input has 4 numbers; expected the 2 of a state");
+    check_shell("printf '0,0\\n0,x\\n' | " + act, 1, "line 2 of the input: \"x\" is not a finite number");
+    check_shell("echo 1e99,0 | " + act, 1, "is not a finite number");
+    check_shell(act + scratch / "absent", 1, "cannot open");
+    check_shell(act + "--set alpha=0.5", 2, "eval and act take --set");
 }
 
 // WODTEM sec. IV-B.3, step 4 test; WODTEM sec. IV-B.3, step 5 test
