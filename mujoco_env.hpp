@@ -181,17 +181,19 @@ inline const char* embedded_model(Rules rules) {
     return rules == Rules::halfcheetah ? wodtem_halfcheetah_xml : wodtem_ant_xml;
 }
 
-// A box for each wall of the map, in row-major order.
+// A box for each wall of the map, in row-major order. What stands still has margin 0, here and in data/*.xml, and what
+// moves the original's: up to MuJoCo 3.4 a contact begins at the larger of two margins, later at their sum.
 inline std::string maze_walls(const MujocoTask& task) {
     std::string xml;
     for (const auto [row, column] : cells_marked(task.maze, '1')) {
         char wall[200];
         if (task.rules == Rules::antmaze)
-            std::snprintf(wall, sizeof wall, R"(<geom type="box" pos="%d %d 1" size="2 2 1" conaffinity="1"/>)",
+            std::snprintf(wall, sizeof wall,
+                          R"(<geom type="box" pos="%d %d 1" size="2 2 1" conaffinity="1" margin="0"/>)",
                           4 * (column - 1), 4 * (row - 1));
         else
-            std::snprintf(wall, sizeof wall, R"(<geom type="box" pos="%d %d 0" size="0.5 0.5 0.2"/>)", row + 1,
-                          column + 1);
+            std::snprintf(wall, sizeof wall, R"(<geom type="box" pos="%d %d 0" size="0.5 0.5 0.2" margin="0"/>)",
+                          row + 1, column + 1);
         xml += wall;
     }
     return xml;
@@ -208,7 +210,7 @@ inline std::string maze2d_model(const MujocoTask& task) {
     <motor ctrllimited="true" ctrlrange="-1 1" gear="100"/>
   </default>
   <worldbody>
-    <geom type="plane" pos="0 0 -0.1" size="40 40 0.25" contype="1" conaffinity="0"/>
+    <geom type="plane" pos="0 0 -0.1" size="40 40 0.25" contype="1" conaffinity="0" margin="0"/>
     <body pos="1.2 1.2 0">
       <joint name="x" axis="1 0 0"/>
       <joint name="y" axis="0 1 0"/>
