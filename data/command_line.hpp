@@ -140,7 +140,7 @@ inline void print_command_list(std::span<const Command> commands) {
     std::printf(
         "wodtem: decision transformers that go from offline data to online interaction, with an episodic memory\n\n");
     for (const Command& command : commands)
-        std::printf("  wodtem %-7s %-9s %s\n", command.name, command.words, command.meaning);
+        std::printf("  wodtem %-7s %-12s %s\n", command.name, command.words, command.meaning);
     std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
 }
 
@@ -165,7 +165,7 @@ inline int run_command_line(std::span<const Command> commands, const std::vector
     const auto asks_for_help = [](const std::string& word) {
         return word == "--help" || word == "-h" || word == "help";
     };
-    if (words.empty() || (asks_for_help(words[0]) && words.size() == 1)) {
+    if (std::ranges::all_of(words, asks_for_help)) {
         print_command_list(commands);
     } else if (words[0] == "--version" && words.size() == 1) {
         print_version();
