@@ -409,6 +409,7 @@ inline std::string collect_help() {
     std::string text = "\nID, rows, and how long it takes on one core:\n";
     char line[200];
     for (const PublishedDataSet& set : published_data_sets) {
+        if (set.steps == 0) continue;
         std::snprintf(line, sizeof line, "  %-30s %8zu  %s\n", set.id, set.steps, set.collected_in);
         text += line;
     }
@@ -423,10 +424,11 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
                     const std::string& policy, int threads) {
     const PublishedDataSet* set = find_published(id);
     const bool walker = id == walker_name;
-    if (!set && !walker) {
+    if ((!set || set->steps == 0) && !walker) {
         std::vector<std::string> names = {walker_name};
-        for (const PublishedDataSet& one : published_data_sets) names.push_back(one.id);
-        fail("usage.task", "collect makes D4RL's data sets, and \"%s\" is none%s", id.c_str(),
+        for (const PublishedDataSet& one : published_data_sets)
+            if (one.steps > 0) names.push_back(one.id);
+        fail("usage.task", "collect makes stand-ins for the paper's data sets, and \"%s\" is none%s", id.c_str(),
              nearest_hint(id, names).c_str());
     }
     if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);

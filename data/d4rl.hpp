@@ -25,15 +25,15 @@
 
 struct PublishedDataSet {
     const char* id;
-    const char* file;  // below the address
-    size_t steps;      // rows
-    int trajectories;  // complete ones
-    double mean_return, deviation, high, low;
-    const char* collected_in;  // what `wodtem collect` takes on one core, as measured
-    const char* sha256;        // "": not published
+    const char* file;      // below the address
+    size_t steps = 0;      // rows; 0: not in the paper, and `wodtem collect` makes no stand-in
+    int trajectories = 0;  // complete ones
+    double mean_return = NAN, deviation = NAN, high = NAN, low = NAN;
+    const char* collected_in = "";  // what `wodtem collect` takes on one core, as measured
+    const char* sha256 = "";        // "": not published
 };
 constexpr const char* published_address = "http://rail.eecs.berkeley.edu/datasets/offline_rl/";
-constexpr std::array<PublishedDataSet, 13> published_data_sets{{
+constexpr std::array<PublishedDataSet, 29> published_data_sets{{
     {"hopper-medium-v2", "gym_mujoco_v2/hopper_medium-v2.hdf5", 1000000, 2186, 1422.06, 378.95, 3222.36, 315.87,
      "1 minute", "5bdf1bc4a713c82941de44633df669b36c89850b652a25985166796d25cf71a0"},
     {"hopper-medium-replay-v2", "gym_mujoco_v2/hopper_medium_replay-v2.hdf5", 402000, 2041, 467.30, 511.03, 3192.93,
@@ -57,6 +57,22 @@ constexpr std::array<PublishedDataSet, 13> published_data_sets{{
     {"maze2d-umaze-v1", "maze2d/maze2d-umaze-sparse-v1.hdf5", 1000000, 0, NAN, NAN, NAN, NAN, "3 seconds", ""},
     {"maze2d-medium-v1", "maze2d/maze2d-medium-sparse-v1.hdf5", 2000000, 0, NAN, NAN, NAN, NAN, "8 seconds", ""},
     {"maze2d-large-v1", "maze2d/maze2d-large-sparse-v1.hdf5", 4000000, 0, NAN, NAN, NAN, NAN, "18 seconds", ""},
+    {"hopper-random-v2", "gym_mujoco_v2/hopper_random-v2.hdf5"},
+    {"hopper-medium-expert-v2", "gym_mujoco_v2/hopper_medium_expert-v2.hdf5"},
+    {"hopper-expert-v2", "gym_mujoco_v2/hopper_expert-v2.hdf5"},
+    {"hopper-full-replay-v2", "gym_mujoco_v2/hopper_full_replay-v2.hdf5"},
+    {"walker2d-random-v2", "gym_mujoco_v2/walker2d_random-v2.hdf5"},
+    {"walker2d-medium-expert-v2", "gym_mujoco_v2/walker2d_medium_expert-v2.hdf5"},
+    {"walker2d-expert-v2", "gym_mujoco_v2/walker2d_expert-v2.hdf5"},
+    {"walker2d-full-replay-v2", "gym_mujoco_v2/walker2d_full_replay-v2.hdf5"},
+    {"halfcheetah-random-v2", "gym_mujoco_v2/halfcheetah_random-v2.hdf5"},
+    {"halfcheetah-medium-expert-v2", "gym_mujoco_v2/halfcheetah_medium_expert-v2.hdf5"},
+    {"halfcheetah-expert-v2", "gym_mujoco_v2/halfcheetah_expert-v2.hdf5"},
+    {"halfcheetah-full-replay-v2", "gym_mujoco_v2/halfcheetah_full_replay-v2.hdf5"},
+    {"ant-random-v2", "gym_mujoco_v2/ant_random-v2.hdf5"},
+    {"ant-medium-expert-v2", "gym_mujoco_v2/ant_medium_expert-v2.hdf5"},
+    {"ant-expert-v2", "gym_mujoco_v2/ant_expert-v2.hdf5"},
+    {"ant-full-replay-v2", "gym_mujoco_v2/ant_full_replay-v2.hdf5"},
 }};
 
 inline const PublishedDataSet* find_published(std::string_view id) {
@@ -90,10 +106,12 @@ inline std::string find_data_set(const PublishedDataSet& set) {
         if (std::filesystem::exists(path)) return path;
         looked += (looked.empty() ? "" : " and ") + path;
     }
+    const std::string stand_in =
+        set.steps == 0 ? "" : text_of("a stand-in is made by: wodtem collect ", set.id, " (", set.collected_in, "); ");
     fail("dataset.missing",
-         "the data set of %s is not here: looked for %s. The original is published at %s%s; a stand-in is made by: "
-         "wodtem collect %s (%s); or give a file with --dataset",
-         set.id, looked.c_str(), published_address, set.file, set.id, set.collected_in);
+         "the data set of %s is not here: looked for %s. The original is published at %s%s; %sor give a file with "
+         "--dataset",
+         set.id, looked.c_str(), published_address, set.file, stand_in.c_str());
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -378,8 +396,8 @@ struct OwnData {
     std::vector<Trajectory> trajectories;
 };
 
-// How many moves there are to choose from: one more than the greatest action, where actions are one whole number each and
-// either of an integer type or above 1, which a continuous action cannot be; else 0. Errors: dataset.action.
+// How many moves there are to choose from: one more than the greatest action, where actions are one whole number each
+// and either of an integer type or above 1, which a continuous action cannot be; else 0. Errors: dataset.action.
 inline int number_of_moves(const Rows& rows, const std::string& path) {
     const auto whole = [](float x) { return x == std::floor(x); };
     if (rows.action_dim != 1 || !std::ranges::all_of(rows.actions, whole)) return 0;

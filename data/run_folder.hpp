@@ -8,7 +8,7 @@
 //   model.safetensors        the trained model (model_file.hpp)
 //   policy.csv, start_actions.csv (grid world), paths.csv (mazes): what the report's figures need
 //   finished                 empty; written last
-//   kept.safetensors         with --keep-state: the state before the last evaluation, from which a larger budget goes on
+//   kept.safetensors         with --keep-state: the state before the last evaluation, to go on with a larger budget
 //   budgets                  the smaller budgets of a run that went on, a line each
 //
 // Promises: the checkpoint notes the length and the checksum of both logs, and continuing cuts them back to it, so an

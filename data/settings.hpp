@@ -182,10 +182,13 @@ struct SettingRow {
 };
 
 constexpr const char* task_names =
-    "gridworld|hopper-medium-v2|hopper-medium-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|"
-    "halfcheetah-medium-v2|halfcheetah-medium-replay-v2|ant-medium-v2|ant-medium-replay-v2|antmaze-umaze-v2|"
-    "antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|walker2d-v2|halfcheetah-v2|"
-    "ant-v2|data";
+    "gridworld|hopper-medium-v2|hopper-medium-replay-v2|hopper-random-v2|hopper-medium-expert-v2|hopper-expert-v2|"
+    "hopper-full-replay-v2|walker2d-medium-v2|walker2d-medium-replay-v2|walker2d-random-v2|walker2d-medium-expert-v2|"
+    "walker2d-expert-v2|walker2d-full-replay-v2|halfcheetah-medium-v2|halfcheetah-medium-replay-v2|"
+    "halfcheetah-random-v2|halfcheetah-medium-expert-v2|halfcheetah-expert-v2|halfcheetah-full-replay-v2|"
+    "ant-medium-v2|ant-medium-replay-v2|ant-random-v2|ant-medium-expert-v2|ant-expert-v2|ant-full-replay-v2|"
+    "antmaze-umaze-v2|antmaze-umaze-diverse-v2|maze2d-umaze-v1|maze2d-medium-v1|maze2d-large-v1|hopper-v2|"
+    "walker2d-v2|halfcheetah-v2|ant-v2|data";
 constexpr const char* own_data = "data";  // the task of a data set that belongs to none of the others
 constexpr double many = 1e9;
 // WODTEM Table I: each row is the source of a value below.

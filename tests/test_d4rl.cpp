@@ -327,7 +327,10 @@ TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
     before ? setenv("D4RL_DATASET_DIR", kept.c_str(), 1) : unsetenv("D4RL_DATASET_DIR");
     std::filesystem::remove_all(folder);
     CHECK(find_published("maze2d-huge-v1") == nullptr);
-    for (const PublishedDataSet& one : published_data_sets) CHECK(find_mujoco_task(one.id) != nullptr);
+    for (const PublishedDataSet& one : published_data_sets) {
+        CHECK(find_mujoco_task(one.id) != nullptr);
+        CHECK_EQUAL(default_settings(one.id, "odt", "paper").task, one.id);
+    }
 }
 
 TEST(any_name_of_a_data_set_is_read_back_and_its_checksum_alone_tells_data_apart) {
