@@ -220,7 +220,7 @@ inline Identity identity_of(const Settings& settings) {
     return out;
 }
 
-// The folder itself if it is a run's, else the run folders directly below it, sorted. Errors: report.folder.
+// The folder itself if it is a run's, else the run folders directly below it, in any order. Errors: report.folder.
 inline std::vector<std::string> run_folders(const std::string& folder) {
     const auto holds_run = [](const std::string& path) { return std::filesystem::exists(path + "/settings"); };
     if (holds_run(folder)) return {folder};
@@ -233,7 +233,6 @@ inline std::vector<std::string> run_folders(const std::string& folder) {
              "%s: is no run folder and has none directly below it: nowhere there is a file `settings`, which training "
              "writes first",
              folder.c_str());
-    std::ranges::sort(found);
     return found;
 }
 

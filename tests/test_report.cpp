@@ -394,6 +394,9 @@ TEST(the_dose_is_shown_in_thousandths_where_it_was_logged) {
     const std::string page = read_file(scratch.path + "/report/report.md");
     CHECK(narrow(page).find("| WODTEM | 25.00 ± 7.07 | 10.00 ± 0.00 | 1.00 ± 0.71 |") != std::string::npos);
     CHECK(page.find("| ODT | 25") == std::string::npos);
+    const std::string header = "interactions,eval_length,eval_return,eval_score,advice,advice_distance,advice_shift\n";
+    write(folders[3], "progress.csv",
+          header + "0,6,1,1,nan,nan,nan\n9,6,1,1,nan,nan,nan\n");  // of a method without one
     report({folders[3]}, scratch.path + "/report");
     CHECK(read_file(scratch.path + "/report/report.md").find("dose") == std::string::npos);
 }
