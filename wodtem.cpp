@@ -815,6 +815,8 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     drawing_and_reading.reset();
     if (resumed || had_log) print_continuation(path, resumed, run.progress.updates);
     if (!resumed) folder.begin_logs(settings);
+    SecondsLog seconds{folder.file("seconds.csv"), machine_text(options.kernel, options.threads)};
+    seconds.begin(resumed, run.progress.updates, run.progress.interactions);
 
     // Each event of the run has its row in a log; rows come before the checkpoint that counts them.
     Watcher watcher{run, folder, options};
@@ -823,6 +825,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     observer.evaluated = [&](const ProgressRow& row, const Evaluation& evaluation) {
         save_maze_paths(folder, evaluation.episodes, run.environments.all());
         folder.progress.append(progress_line(row, settings));
+        seconds.append(row.updates, row.interactions);
     };
     observer.played = [&](const EpisodeRow& row) { folder.episodes.append(episode_line(row, settings)); };
     observer.dropped = [](const std::string& sentence) { std::fprintf(stderr, "wodtem: %s\n", sentence.c_str()); };
@@ -958,7 +961,8 @@ const Command commands[] = {
      collect_help},
     {"trace", "TASK", 1, 1, "step a MuJoCo task from given states through given actions, to 17 digits",
      [](const Arguments& a) { trace_task(a.words[0], a["--physics"]); }, trace_help},
-    {"report", "DIR...", 1, 10000, "tables and figures of runs: one HTML file, SVG files, Markdown", command_report},
+    {"report", "DIR...", 1, 10000, "tables and figures of runs, or of all in a folder: HTML, SVG, Markdown",
+     command_report},
     {"sweep", "[TASK]", 0, 1, "print one train command per method and seed, for any job runner", command_sweep},
     {"info", "FILE", 1, 1, "what is in a data set, a model or a checkpoint, and what it means",
      [](const Arguments& a) { print_info(a.words[0], a["--task"]); }},

@@ -459,9 +459,14 @@ inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
     return runs;
 }
 
+// The first line of a run.
 inline void announce(const PlannedRun& run) {
-    std::fprintf(stderr, "%s: trains on %s, preset %s, in %s; all its settings: %s/settings\n", run.label.c_str(),
-                 data_name(run.settings).c_str(), run.settings.preset.c_str(), run.folder.c_str(), run.folder.c_str());
+    const Settings& settings = run.settings;
+    const std::string data = settings.task == "gridworld" ? "made on the spot"
+                             : settings.dataset == "none" ? "none (random actions)"
+                                                          : settings.dataset;
+    std::fprintf(stderr, "%s: task %s, preset %s, data set %s, folder %s (its file settings has all the rest)\n",
+                 run.label.c_str(), settings.task.c_str(), settings.preset.c_str(), data.c_str(), run.folder.c_str());
 }
 
 // One for each method of a sweep, all checked but for the data set, which its machine must have. Errors: usage.*.

@@ -2,18 +2,20 @@
 //
 //   +---------------------------------------+   A chart is 720 units wide and set in type of 13 and more, so that it
 //   | title, subtitle                       |   can be read at half that width. Colours: Okabe and Ito's, distinct to
-//   | y |  grid, bands and lines, or bars   |   colour-blind eyes. The background is painted, so that figures read on
+//   | y |  grid, lines, or bars             |   colour-blind eyes. The background is painted, so that figures read on
 //   |   +---------------------------------  |   dark pages too. The legend has its own rows below the plot: it never
 //   |      x ticks, x label, legend rows    |   covers data.
 //   +---------------------------------------+
 //
 // Promises: equal data give equal text in every locale; no scripts, fonts or other files are needed; all text is
-// escaped; numbers that are NaN, or 1e15 and beyond, break a line or leave a bar out and are never written.
+// escaped; numbers that are NaN, or 1e15 and beyond, are left out; nothing is drawn beyond the values that are given.
 // Leaves out: knowledge of what is drawn (labels come from the caller, in UTF-8), interaction, exact text widths.
 // Order: SVG elements; the whole figure; charts; maps of cells; tables and pages.
 #pragma once
 
 #include <charconv>
+#include <map>
+#include <set>
 #include <variant>
 
 #include "../nn.hpp"  // and with it the other standard headers
@@ -183,12 +185,17 @@ inline Axis linear_axis(double low, double high, int count, double from, double 
 
 inline constexpr double plot_top = 50, plot_bottom = 350, plot_right = width - 40;
 
-// One mean and one deviation (half the height of a band or of an error bar) for each x or category; NaN: none.
+struct Point {
+    double x, y;
+};
+using Line = std::vector<Point>;  // straight between its points; x never falls
+
+// The lines of some runs, one each. Of bars x is the category's index.
 struct Series {
     std::string label;
     const char* colour;
-    std::vector<double> mean, deviation;
-    bool dashed = false;  // a dashed line lies on top of the others, which show in its gaps
+    std::vector<Line> lines;
+    bool level = false;  // has no x: each line is its last point's y, dashed from side to side above the others
 };
 // A diamond right of the plot; each mark has a column of its own, so that they never cover each other.
 struct Mark {
@@ -197,46 +204,75 @@ struct Mark {
     double value;
 };
 struct Chart {
-    std::string title, x_label, y_label;       // labels with units
-    std::vector<double> x = {};                // of the points of the lines, rising
-    std::vector<std::string> categories = {};  // of the bars; empty: a chart of lines
+    std::string title, subtitle, x_label, y_label;  // labels with units
+    std::vector<std::string> categories = {};       // of the bars; empty: a chart of lines
     std::vector<Series> series = {};
     std::vector<Mark> marks = {};
-    double low = -INFINITY, high = INFINITY;  // of the quantity: no band or stroke goes beyond
-    std::string subtitle = {};
+    std::vector<double> covers = {};  // what the y axis covers beside the points, so that charts can be compared
 
     bool bars() const { return !categories.empty(); }
-    size_t points() const { return bars() ? categories.size() : x.size(); }
 };
 
-// The low and the high end of the band or stroke at point i: one deviation from its mean, or none, as far as the
-// quantity goes.
-inline std::pair<double, double> ends_at(const Chart& chart, const Series& s, size_t i) {
-    const double mean = s.mean[i], deviation = drawable(s.deviation[i]) ? s.deviation[i] : 0;
-    return {std::min(mean, std::max(mean - deviation, chart.low)),
-            std::max(mean, std::min(mean + deviation, chart.high))};
+// The line's height at x; NaN before its first point and after its last.
+inline double height_at(const Line& line, double x) {
+    const auto right = std::ranges::upper_bound(line, x, {}, &Point::x);
+    if (right == line.begin()) return NAN;
+    const Point left = right[-1];
+    if (left.x == x) return left.y;
+    return right == line.end() ? NAN : left.y + (right->y - left.y) * (x - left.x) / (right->x - left.x);
 }
 
-// The axis covers the points with their bands or strokes, and the marks; of bars the zero too.
-inline Axis y_axis(const Chart& chart) {
-    double low = chart.bars() ? 0 : INFINITY, high = chart.bars() ? 0 : -INFINITY;
-    const auto include = [&](const std::pair<double, double>& ends) {
-        low = std::min(low, ends.first);
-        high = std::max(high, ends.second);
-    };
-    for (const Series& s : chart.series)
-        for (size_t i = 0; i < s.mean.size(); ++i)
-            if (drawable(s.mean[i])) include(ends_at(chart, s, i));
-    for (const Mark& mark : chart.marks)
-        if (drawable(mark.value)) include({mark.value, mark.value});
+// The mean of lines, as far as all of them go: straight between the points of any of them.
+inline Line mean_of(const std::vector<Line>& lines) {
+    std::set<double> places;
+    for (const Line& line : lines)
+        for (const Point& point : line) places.insert(point.x);
+    Line mean;
+    for (const double x : places) {
+        double sum = 0;
+        for (const Line& line : lines) sum += height_at(line, x);
+        if (drawable(sum)) mean.push_back({x, sum / static_cast<double>(lines.size())});
+    }
+    return mean;
+}
+
+// What can be drawn of a chart: points that are numbers, lines with points, series with lines. A level series has, in
+// the place of each line, one from side to side.
+inline std::vector<Series> drawn_series(const Chart& chart) {
+    std::vector<Series> all = chart.series;
+    for (Series& s : all) {
+        for (Line& line : s.lines) std::erase_if(line, [](const Point& p) { return !drawable(p.x) || !drawable(p.y); });
+        std::erase_if(s.lines, [](const Line& line) { return line.empty(); });
+        for (Line& line : s.lines)
+            if (s.level) line = {{0, line.back().y}, {INFINITY, line.back().y}};
+    }
+    std::erase_if(all, [](const Series& s) { return s.lines.empty(); });
+    return all;
+}
+
+// The axis covers the points, the marks and what else the chart asks for; of bars the zero too.
+inline Axis y_axis(const Chart& chart, const std::vector<Series>& series) {
+    std::vector<double> values = chart.covers;
+    if (chart.bars()) values.push_back(0);
+    for (const Series& s : series)
+        for (const Line& line : s.lines)
+            for (const Point& point : line) values.push_back(point.y);
+    for (const Mark& mark : chart.marks) values.push_back(mark.value);
+    std::erase_if(values, [](double value) { return !drawable(value); });
+    if (values.empty()) return linear_axis(0, 1, 5, plot_bottom, plot_top);
+    const auto [low, high] = std::ranges::minmax(values);
     return linear_axis(low, high, 5, plot_bottom, plot_top);
 }
 
-// Lines end with their last point, between ticks or not; each bar's category has a slot of width 1 around its index.
-inline Axis x_axis(const Chart& chart, double left) {
-    const bool empty = chart.x.empty();
-    Axis axis = linear_axis(empty ? 0 : chart.x.front(), empty ? 1 : chart.x.back(), 6, left, plot_right);
-    if (chart.x.size() > 1) axis.high = chart.x.back();
+// Lines begin at 0 and end with the last point, between ticks or not; each bar's category has a slot of width 1 around
+// its index.
+inline Axis x_axis(const Chart& chart, const std::vector<Series>& series, double left) {
+    double last = 0;
+    for (const Series& s : series)
+        for (const Line& line : s.lines)
+            if (!s.level) last = std::max(last, line.back().x);
+    Axis axis = linear_axis(0, last > 0 ? last : 1, 6, left, plot_right);
+    if (last > 0) axis.high = last;
     std::erase_if(axis.ticks, [&](const Tick& tick) { return tick.value > axis.high; });
     if (chart.bars()) axis = {-0.5, static_cast<double>(chart.categories.size()) - 0.5, left, plot_right, {}};
     for (const std::string& category : chart.categories)
@@ -261,39 +297,42 @@ inline std::string draw_axes(const Chart& chart, const Axis& x, const Axis& y) {
            text((x.from + x.to) / 2, y.from + 46, chart.x_label, larger) + text(0, 0, chart.y_label, larger + upwards);
 }
 
-inline std::string line_style(const Series& s) {
-    return stroke(s.colour, 2.5) + (s.dashed ? " stroke-dasharray=\"7 5\"" : "");
+inline std::string line_style(const Series& s, double thickness) {
+    return stroke(s.colour, thickness) + (s.level ? " stroke-dasharray=\"7 5\"" : "");
 }
 
-// One series: a band, and a line that breaks where a mean is missing; a dot ends each piece.
-inline void draw_line(const Series& s, const Chart& chart, const Axis& x, const Axis& y, std::string& bands,
-                      std::string& lines) {
-    std::string middle, upper, lower;  // of the piece so far
-    for (size_t i = 0; i < chart.points(); ++i) {
-        if (!drawable(s.mean[i])) continue;
-        const double px = x.at(chart.x[i]);
-        const auto [low, high] = ends_at(chart, s, i);
-        middle += point(px, y.at(s.mean[i]));
-        upper += point(px, y.at(high));
-        lower = point(px, y.at(low)) + lower;
-        if (i + 1 < chart.points() && drawable(s.mean[i + 1])) continue;
-        bands += path(upper + lower + "Z", fill(s.colour) + " fill-opacity=\"0.18\"");
-        lines += path(middle, line_style(s)) + circle(px, y.at(s.mean[i]), 3, fill(s.colour));
-        middle = upper = lower = "";
+// One series: each line thin, with a dot at every point while dots can be told apart, and their mean thick above them.
+inline void draw_lines(const Series& s, const Axis& x, const Axis& y, std::string& thin, std::string& thick) {
+    constexpr size_t most_dots = 120;
+    const auto place = [&](const Point& p) { return point(x.at(p.x), y.at(p.y)); };
+    for (const Line& line : s.lines) {
+        std::string points, dots;  // a dot is a stroke of no length with round ends
+        for (const Point& p : line) {
+            points += place(p);
+            dots += (dots.empty() ? "" : "M ") + place(p) + "h 0 ";
+        }
+        if (s.lines.size() > 1) thin += path(points, line_style(s, 1) + " stroke-opacity=\"0.5\"");
+        if (!s.level && line.size() <= most_dots) thin += path(dots, stroke(s.colour, 5) + " stroke-linecap=\"round\"");
     }
+    std::string points;
+    for (const Point& p : mean_of(s.lines)) points += place(p);
+    if (!points.empty()) thick += path(points, line_style(s, 2.5));
 }
 
-// The bars of series k, with a stroke of one deviation to either side. Bars of one category share 0.8 of its slot.
-inline std::string draw_bars(size_t k, const Chart& chart, const Axis& x, const Axis& y) {
-    const Series& s = chart.series[k];
-    const double share = 0.8 / static_cast<double>(chart.series.size());
+// The bars of series k of `count`: means, each with a stroke from the lowest to the highest of its values. Bars of one
+// category share 0.8 of its slot.
+inline std::string draw_bars(const Series& s, size_t k, size_t count, const Axis& x, const Axis& y) {
+    std::map<double, std::vector<double>> values;  // of each category
+    for (const Line& line : s.lines)
+        for (const Point& p : line) values[p.x].push_back(p.y);
+    const double share = 0.8 / static_cast<double>(count);
     std::string out;
-    for (size_t i = 0; i < s.mean.size(); ++i) {
-        if (!drawable(s.mean[i])) continue;
-        const double start = static_cast<double>(i) - 0.4 + share * static_cast<double>(k);
-        const double left = x.at(start), w = x.at(start + 0.92 * share) - left, top = y.at(s.mean[i]);
+    for (const auto& [category, heights] : values) {
+        const double mean = std::accumulate(heights.begin(), heights.end(), 0.0) / static_cast<double>(heights.size());
+        const double start = category - 0.4 + share * static_cast<double>(k);
+        const double left = x.at(start), w = x.at(start + 0.92 * share) - left, top = y.at(mean);
         out += rectangle(left, top, w, y.at(0) - top, fill(s.colour));
-        const auto [low, high] = ends_at(chart, s, i);
+        const auto [low, high] = std::ranges::minmax(heights);
         const double middle = left + w / 2;
         if (high > low) out += line(middle, y.at(high), middle, y.at(low), stroke(ink, 1.5));
     }
@@ -304,38 +343,34 @@ inline std::string diamond(double x, double y, const char* colour) {
     return path(point(x - 5, y) + point(x, y - 7) + point(x + 5, y) + point(x, y + 7) + "Z", fill(colour));
 }
 
-// Lines with their bands, or bars in groups; marks beside them; the legend below.
-// Errors: figure.length if a series has not one number for each x or category.
+// Lines with their means, or bars in groups; marks beside them; the legend below. A series without points has no entry.
 inline std::string draw_chart(const Chart& chart) {
-    for (const Series& s : chart.series)
-        if (s.mean.size() != chart.points() || s.deviation.size() != chart.points())
-            fail("figure.length", "figure \"%s\": \"%s\" has %zu means and %zu deviations, expected %zu of each",
-                 chart.title.c_str(), s.label.c_str(), s.mean.size(), s.deviation.size(), chart.points());
-    const Axis y = y_axis(chart);
+    const std::vector<Series> series = drawn_series(chart);
+    const Axis y = y_axis(chart, series);
     double widest = 0;
     for (const Tick& tick : y.ticks) widest = std::max(widest, text_width(tick.label));
-    const Axis x = x_axis(chart, 50 + widest);
-    std::string bands, data, dashed_lines;
+    const Axis x = x_axis(chart, series, 50 + widest);
+    std::string thin, thick, levels;
     std::vector<Key> keys;
-    for (size_t k = 0; k < chart.series.size(); ++k) {
-        const Series& s = chart.series[k];
+    for (size_t k = 0; k < series.size(); ++k) {
+        const Series& s = series[k];
         if (chart.bars())
-            data += draw_bars(k, chart, x, y);
+            thick += draw_bars(s, k, series.size(), x, y);
         else
-            draw_line(s, chart, x, y, bands, s.dashed ? dashed_lines : data);
+            draw_lines(s, x, y, thin, s.level ? levels : thick);
         const std::string key =
-            chart.bars() ? rectangle(6, -7, 14, 14, fill(s.colour)) : line(0, 0, 26, 0, line_style(s));
+            chart.bars() ? rectangle(6, -7, 14, 14, fill(s.colour)) : line(0, 0, 26, 0, line_style(s, 2.5));
         keys.push_back({key, s.label});
     }
     double column = x.to + 8;
     for (const Mark& mark : chart.marks) {
         if (!drawable(mark.value)) continue;
-        data += diamond(column, y.at(mark.value), mark.colour);
+        thick += diamond(column, y.at(mark.value), mark.colour);
         column += 11;
         keys.push_back({diamond(13, 0, mark.colour), mark.label});
     }
-    return picture(width, plot_bottom + 72, chart.title, chart.subtitle,
-                   draw_axes(chart, x, y) + bands + data + dashed_lines, keys);
+    return picture(width, plot_bottom + 72, chart.title, chart.subtitle, draw_axes(chart, x, y) + thin + thick + levels,
+                   keys);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -440,16 +475,32 @@ inline std::string draw_map(const CellMap& map) {
 struct Table {
     std::vector<std::string> header;
     std::vector<std::vector<std::string>> rows;
+    bool pages_only = false;  // not for the terminal
+};
+// Links to files of a folder, whose path counts from the folder of the pages.
+struct Files {
+    std::string label, folder;
+    std::vector<std::string> names;
 };
 struct Figure {
     std::string svg, caption, file;  // file: its name, for Markdown pages
 };
-using Part = std::variant<std::string, Table, Figure>;  // text: a paragraph
+using Part = std::variant<std::string, Table, Figure, Files>;  // text: a paragraph
 struct Section {
     std::string heading;
     std::vector<Part> parts;
     std::string verdict = "";  // one sentence for the top of the page, or empty
 };
+
+// A path in a link: what has a meaning of its own there is written as a percent sign and its code.
+inline std::string url_of(std::string path) {
+    for (const char c : std::string("% #?&<>()\"")) {
+        char code[4];
+        std::snprintf(code, sizeof code, "%%%02X", static_cast<unsigned>(c));
+        path = svg::replaced(path, c, code);
+    }
+    return path;
+}
 
 // One line of fields, filled up with spaces to the widths of their columns; the first is flush left.
 inline std::string markdown_row(const std::vector<std::string>& fields, const std::vector<size_t>& widths) {
@@ -483,6 +534,11 @@ struct Markdown {
     std::string operator()(const Figure& figure) const {
         return "![](" + figure.file + ")\n\n" + figure.caption + "\n\n";
     }
+    std::string operator()(const Files& files) const {
+        std::string out = files.label + ":";
+        for (const std::string& name : files.names) out += " [" + name + "](" + url_of(files.folder + "/" + name) + ")";
+        return out + "\n\n";
+    }
 };
 
 // Text between the tags of one HTML element.
@@ -490,7 +546,8 @@ inline std::string tagged(const std::string& tag, const std::string& text) {
     return "<" + tag + ">" + svg::escaped(text) + "</" + tag + ">";
 }
 
-// Parts as HTML. On a narrow screen wide tables and figures scroll in their own box.
+// Parts as HTML. On a narrow screen wide tables and figures scroll in their own box; on a wide one figures that follow
+// each other stand side by side.
 struct Html {
     std::string heading(int level, const std::string& text) const {
         return tagged("h" + std::to_string(level), text) + "\n";
@@ -510,6 +567,12 @@ struct Html {
         return "<figure><div class=\"wide\">" + figure.svg + "</div>" + tagged("figcaption", figure.caption) +
                "</figure>\n";
     }
+    std::string operator()(const Files& files) const {
+        std::string out = "<p class=\"files\">" + svg::escaped(files.label) + ":";
+        for (const std::string& name : files.names)
+            out += " <a href=\"" + url_of(files.folder + "/" + name) + "\">" + svg::escaped(name) + "</a>";
+        return out + "</p>\n";
+    }
 };
 
 // The title, all verdicts, then the sections.
@@ -525,15 +588,18 @@ inline std::string page(const auto& writer, const std::string& title, const std:
 }
 
 inline constexpr const char* style_sheet =
-    "body { margin: 2rem auto; max-width: 60rem; padding: 0 1rem; font: 16px/1.55 sans-serif;\n"
-    "  color: #222; background: #fff }\n"
-    "h1 { font-size: 1.7rem; line-height: 1.2 } h2 { font-size: 1.25rem; margin-top: 2.5rem }\n"
-    "p, figure { max-width: 46rem } .wide { overflow-x: auto } figure { margin: 1.5rem 0 }\n"
+    "body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem; font: 16px/1.55 sans-serif; color: #222;\n"
+    "  background: #fff; display: grid; grid-template-columns: 1fr 1fr; column-gap: 2rem }\n"
+    "body > * { grid-column: 1 / -1; min-width: 0 } body > figure { grid-column: auto; margin: 1rem 0 }\n"
+    "h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 } h2 { font-size: 1.25rem; margin: 2rem 0 0 }\n"
+    "p { max-width: 50rem; margin: 0.7rem 0 } .files { margin: 0 } .wide { overflow-x: auto }\n"
     "figcaption { color: #555; font-size: 0.9rem }\n"
     "svg { display: block; max-width: 100%; min-width: 30rem; height: auto }\n"
-    "table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 1rem 0 }\n"
-    "th, td { padding: 0.3rem 0.8rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap }\n"
-    "th { border-bottom: 2px solid #222 } th:first-child, td:first-child { text-align: left; padding-left: 0 }\n";
+    "table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.9rem; margin: 0.7rem 0 }\n"
+    "th, td { padding: 0.25rem 0.7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top }\n"
+    "td { white-space: nowrap } td:first-child, td:last-child { white-space: normal; overflow-wrap: break-word }\n"
+    "th { border-bottom: 2px solid #222 } th:first-child, td:first-child { text-align: left; padding-left: 0 }\n"
+    "@media (max-width: 60rem) { body > figure { grid-column: 1 / -1 } }\n";
 
 // The page as one file that needs nothing else.
 inline std::string html_page(const std::string& title, const std::vector<Section>& sections) {

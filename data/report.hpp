@@ -1,10 +1,11 @@
 // report.hpp: run folders in, tables and figures out: report.html (one file that needs nothing else), its figures as
 // SVG files, and report.md. Answers WODTEM figs. 1 and 4 (sec. IV-A, V-D); other tasks get the curves of score and
-// length, and mazes the paths through them. One sentence for each task compares the runs with the paper.
+// length, and mazes the paths through them; all get curves of their training. One sentence for each task compares the
+// runs with the paper.
 //
-// Reads what run_folder.hpp writes: settings, command (older folders have none), progress.csv, episodes.csv (without
-// the file `finished` these logs may be missing or incomplete); of mazes paths.csv, if it is there; of finished grid
-// worlds policy.csv and start_actions.csv.
+// Reads what run_folder.hpp writes: settings, command and seconds.csv (older folders have none), progress.csv,
+// episodes.csv (without the file `finished` these logs may be missing or incomplete); of mazes paths.csv, if it is
+// there; of finished grid worlds policy.csv and start_actions.csv.
 // Promises: every number comes from these files or is marked as the paper's; equal folders give equal bytes; runs are
 // averaged only if all their settings but the seed are equal, those of the data and the first weights included, and
 // other runs stand in rows of their own, whose labels name what differs; errors name file and line.
@@ -12,6 +13,7 @@
 // Order: logs; one run folder; numbers; the paper's results; figures; tables; sections; the report.
 #pragma once
 
+#include "console.hpp"
 #include "figures.hpp"
 #include "settings.hpp"
 
@@ -57,7 +59,7 @@ struct Log {
         std::vector<double> out;
         for (const std::string& field : texts(column)) {
             out.push_back(to_number(field).value_or(none));
-            const bool missing = may_be_nan && field.ends_with("nan");
+            const bool missing = may_be_nan && (field.ends_with("nan") || field.ends_with("inf"));
             if (!missing && !(out.back() >= low && out.back() <= high))
                 fail("csv.number", "%s: line %zu: column \"%s\" holds \"%s\", expected a number from %g to %g",
                      path.c_str(), out.size() + 1, column, field.c_str(), low, high);
@@ -65,16 +67,18 @@ struct Log {
         return out;
     }
 
-    // A column of results; NaN where an evaluation came to nothing.
-    std::vector<double> results(const char* column) const { return numbers(column, -1e12, 1e12, true); }
+    // A column of results; NaN where there is none.
+    std::vector<double> results(const char* column, double most = 1e12) const {
+        return numbers(column, -most, most, true);
+    }
 
-    // The column of online interactions, which must not fall. Errors: csv.order.
-    std::vector<double> interactions() const {
-        const std::vector<double> out = numbers("interactions", 0, 1e12);
+    // A column of counts, which must not fall. Errors: csv.number, csv.order.
+    std::vector<double> counts(const char* column) const {
+        const std::vector<double> out = numbers(column, 0, 1e12);
         const auto falls = std::is_sorted_until(out.begin(), out.end());
         if (falls != out.end())
-            fail("csv.order", "%s: line %td: column \"interactions\" falls to %.0f", path.c_str(),
-                 falls - out.begin() + 2, *falls);
+            fail("csv.order", "%s: line %td: column \"%s\" falls to %.0f", path.c_str(), falls - out.begin() + 2,
+                 column, *falls);
         return out;
     }
 
@@ -122,20 +126,32 @@ struct Run {
     size_t method = 0;                   // in `methods`
     const MujocoTask* mujoco = nullptr;  // null: the grid world
     bool finished = false;
-    double so_far = 0;                                          // online interactions
-    std::vector<double> interactions, length, total, score;     // of each evaluation; total: the return
-    std::vector<double> advice, advice_distance, advice_shift;  // the dose before each evaluation; empty: not logged
-    std::vector<double> episode_length, episode_return;         // of each online episode
-    std::vector<MoveShares> policy;                             // [36], or empty
-    std::array<std::vector<double>, 3> start_actions;           // learned, D_offline, D_online: [8] each, or empty
-    std::vector<MazeEpisode> paths;                             // of the latest evaluation in a maze, or empty
+    double so_far = 0;                                    // online interactions
+    std::map<std::string, std::vector<double>> progress;  // counts and result_columns of progress.csv
+    std::vector<double> episode_length, episode_return;   // of each online episode
+    std::vector<MoveShares> policy;                       // [36], or empty
+    std::array<std::vector<double>, 3> start_actions;     // learned, D_offline, D_online: [8] each, or empty
+    std::vector<MazeEpisode> paths;                       // of the latest evaluation in a maze, or empty
+    std::vector<std::string> time;                        // cells of time_table(), or empty
+    std::vector<std::string> files;                       // those to look at
 
     const Method& about_method() const { return methods[method]; }
     bool offline_only() const { return method == 0; }
+    // Empty if the run's program did not log it.
+    std::vector<double> column(const std::string& name) const {
+        const auto found = progress.find(name);
+        return found == progress.end() ? std::vector<double>{} : found->second;
+    }
 };
-using Runs = std::vector<const Run*>;              // of one row unless said otherwise, by seed; never empty
-using Quantity = std::vector<double> Run::*;       // length, total or score; of the dose
-using Summary = double (*)(const Run&, Quantity);  // final_value or last_ten
+using Runs = std::vector<const Run*>;                          // of one row unless said otherwise, by seed; never empty
+using Quantity = std::string;                                  // a column of progress.csv
+using Summary = double (*)(const Run&, const Quantity& name);  // final_value or last_ten
+
+// The columns of results that are read. Every program wrote the first three. The first six are written as numbers, and
+// so are bounded; the others are only drawn, as far as they can be.
+constexpr std::array result_columns{"eval_length",     "eval_return",  "eval_score",    "advice",
+                                    "advice_distance", "advice_shift", "loss",          "entropy",
+                                    "lambda",          "short",        "gradient_norm", "rollout_return"};
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
 inline std::vector<MoveShares> read_policy(const Log& log) {
@@ -179,6 +195,19 @@ inline std::vector<MazeEpisode> read_paths(const MujocoTask& task, const Log& lo
     return out;
 }
 
+// seconds.csv in cells of time_table(), the first left empty: the last row's date, the duration, updates a second, and
+// where the run was made. Where seconds do not rise another process went on. Errors: csv.order, csv.number.
+inline std::vector<std::string> read_seconds(const Log& log) {
+    const std::vector<double> updates = log.numbers("updates", 0, 1e12), seconds = log.counts("seconds");
+    if (seconds.empty()) return {};
+    double made = 0;
+    for (size_t i = 1; i < seconds.size(); ++i)
+        if (seconds[i] > seconds[i - 1]) made += updates[i] - updates[i - 1];
+    const double elapsed = seconds.back() - seconds.front(), rate = elapsed > 0 ? made / elapsed : none;
+    const auto last = [&](const char* column) { return log.texts(column).back(); };
+    return {"", last("date"), clock_text(elapsed), svg::grouped(rate, 0), last("machine"), last("program")};
+}
+
 // A row averages over seeds. A data set is known by its checksum, whatever its file is called.
 inline bool identifies(const SettingRow& row) {
     return row.field != Field(&Settings::seed) && row.field != Field(&Settings::dataset);
@@ -191,13 +220,26 @@ inline Identity identity_of(const Settings& settings) {
     return out;
 }
 
-// All files of one run folder. Errors: report.folder, report.setting, and those of settings_from_text() and Log.
+// The folder itself if it is a run's, else the run folders directly below it, in any order. Errors: report.folder.
+inline std::vector<std::string> run_folders(const std::string& folder) {
+    const auto holds_run = [](const std::string& path) { return std::filesystem::exists(path + "/settings"); };
+    if (holds_run(folder)) return {folder};
+    std::vector<std::string> found;
+    std::error_code error;  // of what is no folder: none is found
+    for (const auto& entry : std::filesystem::directory_iterator(folder, error))
+        if (holds_run(entry.path())) found.push_back(entry.path());
+    if (found.empty())
+        fail("report.folder",
+             "%s: is no run folder and has none directly below it: nowhere there is a file `settings`, which training "
+             "writes first",
+             folder.c_str());
+    return found;
+}
+
+// All files of one run folder. Errors: report.setting, and those of settings_from_text() and Log.
 inline Run read_run(const std::string& folder) {
     const auto file = [&](const char* name) { return folder + "/" + name; };
     const auto exists = [&](const char* name) { return std::filesystem::exists(file(name)); };
-    if (!exists("settings"))
-        fail("report.folder", "%s: is no run folder: it has no file `settings`, which training writes first",
-             folder.c_str());
     Run run;
     run.folder = folder;
     run.settings = settings_from_text(read_file(file("settings")), file("settings"));
@@ -209,24 +251,23 @@ inline Run read_run(const std::string& folder) {
     if (run.mujoco && run.settings.physics == "none")
         fail("report.setting", "%s: %s cannot have physics none", file("settings").c_str(), run.settings.task.c_str());
     run.finished = exists("finished");
+    for (const char* name : {"settings", "command", "progress.csv", "episodes.csv", "seconds.csv"})
+        if (exists(name)) run.files.emplace_back(name);
+    if (exists("seconds.csv")) run.time = read_seconds(Log(file("seconds.csv")));
     if (run.finished || exists("progress.csv")) {  // a run that has just begun may not have its logs yet
         const Log log(file("progress.csv"));
-        run.interactions = log.interactions();
-        run.length = log.results("eval_length");
-        run.total = log.results("eval_return");
-        run.score = log.results("eval_score");
-        if (run.settings.method == "wodtem" && contains(log.table.header, "advice")) {
-            run.advice = log.results("advice");
-            run.advice_distance = log.results("advice_distance");
-            run.advice_shift = log.results("advice_shift");
-        }
-        if (!run.interactions.empty()) run.so_far = run.interactions.back();
+        run.progress["interactions"] = log.counts("interactions");
+        if (contains(log.table.header, "updates")) run.progress["updates"] = log.counts("updates");
+        for (size_t i = 0; i < result_columns.size(); ++i)
+            if (i < 3 || contains(log.table.header, result_columns[i]))
+                run.progress[result_columns[i]] = log.results(result_columns[i], i < 6 ? 1e12 : 1e300);
+        if (!log.table.rows.empty()) run.so_far = run.progress["interactions"].back();
     }
     if (!run.offline_only() && (run.finished || exists("episodes.csv"))) {
         const Log log(file("episodes.csv"));
         run.episode_length = log.numbers("length", 1, run.mujoco ? 1e9 : grid_max_steps);
         run.episode_return = log.results("return");
-        const std::vector<double> at = log.interactions();
+        const std::vector<double> at = log.counts("interactions");
         if (!at.empty()) run.so_far = std::max(run.so_far, at.back());
     }
     if (run.mujoco && run.mujoco->maze && exists("paths.csv"))
@@ -264,71 +305,33 @@ inline std::string plus_minus(const Spread& spread) {
     return svg::grouped(spread.mean, 2) + " ± " + svg::grouped(spread.deviation, 2);
 }
 
-// Mean and deviation over runs of each entry of row_of(run), a list that is equally long for all runs.
-inline svg::Series mean_series(const std::string& label, const char* colour, const Runs& runs, const auto& row_of) {
-    std::vector<std::vector<double>> rows;
-    for (const Run* run : runs) rows.push_back(row_of(*run));
-    svg::Series out{label, colour, {}, {}};
-    for (size_t i = 0; i < rows.at(0).size(); ++i) {
-        std::vector<double> values;
-        for (const std::vector<double>& row : rows) values.push_back(row[i]);
-        out.mean.push_back(spread_of(values).mean);
-        out.deviation.push_back(spread_of(values).deviation);
-    }
-    return out;
-}
-
-// The value of the last evaluation that has one, after at most `at` interactions.
-inline double value_at(const Run& run, Quantity quantity, double at) {
+// The value of the last evaluation that has one.
+inline double final_value(const Run& run, const Quantity& quantity) {
     double out = none;
-    for (size_t i = 0; i < run.interactions.size() && run.interactions[i] <= at; ++i)
-        if (!std::isnan((run.*quantity)[i])) out = (run.*quantity)[i];
+    for (const double value : run.column(quantity))
+        if (!std::isnan(value)) out = value;
     return out;
 }
-inline double final_value(const Run& run, Quantity quantity) { return value_at(run, quantity, run.so_far); }
 
 // Mean over the last ten evaluations (or all, if there are fewer): one evaluation of a policy that wavers says little.
-inline double last_ten(const Run& run, Quantity quantity) {
-    std::vector<double> values = run.*quantity;
+inline double last_ten(const Run& run, const Quantity& quantity) {
+    std::vector<double> values = run.column(quantity);
     std::erase_if(values, [](double value) { return std::isnan(value); });
     values.erase(values.begin(), values.end() - static_cast<int>(std::min<size_t>(values.size(), 10)));
     return spread_of(values).mean;
 }
 
-inline Spread spread_of(const Runs& runs, Summary summary, Quantity quantity) {
+inline Spread spread_of(const Runs& runs, Summary summary, const Quantity& quantity) {
     std::vector<double> values;
     for (const Run* run : runs) values.push_back(summary(*run, quantity));
     return spread_of(values);
 }
 
-inline double most_interactions(const Runs& runs) { return std::ranges::max(runs, {}, &Run::so_far)->so_far; }
-
-// Seeds are evaluated at different interactions, so all are drawn at 0, 250, 500, ... up to the largest of any run;
-// long runs in larger steps, at most about 400. There are at least two points.
-inline std::vector<double> curve_points(const Runs& runs) {
-    const double largest = std::max(250.0, most_interactions(runs));
-    const double step = 250 * std::ceil(largest / 250 / 400);
-    std::vector<double> out;
-    for (double at = 0; at <= largest; at += step) out.push_back(at);
-    return out;
-}
-
-// A finished run keeps its final value to the end, and shows it at the last point even if it fell a little later; an
-// unfinished one ends at its own last interactions.
-inline std::vector<double> resampled(const Run& run, Quantity quantity, const std::vector<double>& points) {
-    std::vector<double> out;
-    for (const double at : points) {
-        const bool over = !run.finished && at > run.so_far, last = run.finished && at == points.back();
-        out.push_back(over ? none : last ? final_value(run, quantity) : value_at(run, quantity, at));
-    }
-    return out;
-}
-
 // The interactions of the first evaluation from which on every one had this length.
 inline double kept_from(const Run& run, double length) {
+    const std::vector<double> lengths = run.column("eval_length"), at = run.column("interactions");
     double from = none;
-    for (size_t i = 0; i < run.length.size(); ++i)
-        from = run.length[i] != length ? none : std::isnan(from) ? run.interactions[i] : from;
+    for (size_t i = 0; i < lengths.size(); ++i) from = lengths[i] != length ? none : std::isnan(from) ? at[i] : from;
     return from;
 }
 
@@ -502,84 +505,118 @@ inline void name_differences(Group& group) {
     }
 }
 
-// What stands below a figure's title: the conditions, how many seeds its rows have, and what `spread` shows of them.
-inline std::string subtitle(const Group& group, const std::vector<Row>& rows, const std::string& spread) {
-    const auto [least, most] = std::ranges::minmax(rows, {}, [](const Row& row) { return row.runs.size(); });
-    const size_t low = least.runs.size(), high = most.runs.size();
-    if (high == 1) return group.conditions + "; n = 1 seed, so no " + spread;
-    return group.conditions + "; mean over n = " + (low < high ? std::to_string(low) + " to " : "") +
-           std::to_string(high) + " seeds; " + spread + ": one standard deviation to either side";
+// Adds a chart, if there is something to draw. Below its title stand the conditions, how many seeds its series are from,
+// and what `spread` shows of them; file: the end of its name.
+inline void add_chart(std::vector<Part>& parts, const Group& group, svg::Chart chart, const std::string& spread,
+                      const std::string& caption, const std::string& file) {
+    std::set<size_t> seeds;
+    for (const svg::Series& series : svg::drawn_series(chart)) seeds.insert(series.lines.size());
+    if (seeds.empty()) return;
+    const size_t least = *seeds.begin(), most = *seeds.rbegin();
+    chart.subtitle = group.conditions + "; n = 1 seed";
+    if (most > 1)
+        chart.subtitle = group.conditions + "; mean over n = " + (least < most ? std::to_string(least) + " to " : "") +
+                         std::to_string(most) + " seeds; " + spread;
+    parts.emplace_back(Figure{svg::draw_chart(chart), caption, group.file + "-" + file + ".svg"});
 }
 inline std::string subtitle_of_one(const Group& group, const Row& row) {
     return group.conditions + "; one run, of n = " + std::to_string(row.runs.size()) +
            (row.runs.size() > 1 ? " seeds" : " seed");
 }
 
-// Figs. 1b and 4a, and their like for other tasks: means over seeds. The paper's results are marked beside the curves
-// of the quantity that it gives.
-inline Figure curve(const Group& group, Quantity quantity, const std::string& caption) {
-    const bool length = quantity == &Run::length;
-    const char* label = length ? "evaluation length, steps" : "normalised score";
-    svg::Chart chart{group.task + ": " + label, "online interactions", label};
-    chart.subtitle = subtitle(group, group.rows, "band");
-    chart.x = curve_points(group.runs);
-    const MujocoTask* task = group.any().mujoco;
-    if (length) {
-        const bool torus = std::ranges::any_of(group.runs, [](auto* run) { return run->settings.edge == "wraps"; });
-        chart.low = task || torus ? 1 : grid_size - 1;  // the goal lies that many diagonal moves from S
-        chart.high = task ? task->max_episode_steps : grid_max_steps;
-    } else if (task && task->maze) {  // a reward is 0 or 1, and antmaze's 1 is the last
-        chart.low = normalised_score(*task, 0);
-        chart.high = normalised_score(*task, task->rules == Rules::antmaze ? 1 : task->max_episode_steps);
-    }
+// Charts of a column of progress.csv over another one, which never falls; file: the end of the name.
+struct Curve {
+    const char *y, *x, *title, *unit, *file, *caption;
+};
+constexpr Curve curves[] = {
+    {"eval_score", "interactions", "evaluation score", "normalised score", "score", "Mean score of an evaluation."},
+    {"eval_score", "updates", "evaluation score", "normalised score", "score-updates", "The same over updates."},
+    {"eval_length", "interactions", "evaluation length", "steps", "length", "Mean length of an evaluation's episodes."},
+    {"eval_length", "updates", "evaluation length", "steps", "length-updates", "The same over updates."},
+    {"rollout_return", "interactions", "return of online episodes", "return", "rollouts",
+     "Mean over the episodes since the point before."},
+    {"loss", "updates", "loss", "L, eq. (9)", "loss",
+     "Mean over the updates since the point before, as in the other figures over updates but that of lambda."},
+    {"entropy", "updates", "entropy", "H-bar, eq. (10)", "entropy", "Of the policy, on the batches of the updates."},
+    {"lambda", "updates", "lambda", "lambda, eq. (8)", "lambda", "The multiplier of the entropy constraint."},
+    {"gradient_norm", "updates", "gradient", "norm of the gradient", "gradient", "Before it is clipped."},
+    {"short", "updates", "steps that fall short", "share of the steps", "short",
+     "Of the steps in the batches, those with d < e-hat: eq. (7) gives them the weight alpha."},
+};
+
+// The paper's results are marked beside the curves of the quantity that it gives. DT has a single point: as an
+// evaluation it is a level, elsewhere it is left out.
+inline svg::Chart chart_of(const Group& group, const Curve& curve) {
+    const std::string over = curve.x == std::string("updates") ? "updates" : "online interactions";
+    svg::Chart chart{group.task + ": " + curve.title + " over " + over, "", over, curve.unit};
     for (const Row& row : group.rows) {
-        const Method& method = row.any().about_method();
-        chart.series.push_back(mean_series(row.label(), row.colour, row.runs,
-                                           [&](const Run& run) { return resampled(run, quantity, chart.x); }));
-        chart.series.back().dashed = row.any().offline_only();
+        const bool level = row.any().offline_only();
+        if (level && !std::string(curve.y).starts_with("eval_")) continue;
+        svg::Series& series = chart.series.emplace_back(row.label(), row.colour, std::vector<svg::Line>{}, level);
+        for (const Run* run : row.runs) {
+            const std::vector<double> x = run->column(curve.x), y = run->column(curve.y);
+            svg::Line& line = series.lines.emplace_back();
+            for (size_t i = 0; i < std::min(x.size(), y.size()); ++i) line.push_back({x[i], y[i]});
+        }
         const PaperResult* paper = paper_result(row.any());
-        if (paper && row.number == 0 && quantity == group.quantity && !std::isnan(paper->mean))
-            chart.marks.push_back({std::string("paper: ") + method.label, method.colour, paper->mean});
+        if (paper && row.number == 0 && curve.y == group.quantity)
+            chart.marks.push_back({std::string("paper: ") + row.any().about_method().label,
+                                   row.any().about_method().colour, paper->mean});
     }
-    return {svg::draw_chart(chart), caption, group.file + (length ? "-length.svg" : "-score.svg")};
+    return chart;
 }
 
-// Fig. 1c, of the methods with an online phase.
-inline Figure histogram(const Group& group) {
-    svg::Chart chart{group.task + ": lengths of the online episodes", "episode length, steps", "episodes per seed"};
+// The curves whose column `wanted` accepts.
+inline void add_curves(std::vector<Part>& parts, const Group& group, const auto& wanted) {
+    for (const Curve& curve : curves)
+        if (wanted(std::string_view(curve.y)))
+            add_chart(parts, group, chart_of(group, curve), "thin lines: each seed", curve.caption, curve.file);
+}
+
+// Bars of a row's runs; heights(run): of each category, or none.
+inline svg::Series bars_of(const std::string& label, const char* colour, const Runs& runs, const auto& heights) {
+    svg::Series out{label, colour, {}};
+    for (const Run* run : runs) {
+        svg::Line& line = out.lines.emplace_back();
+        for (const double height : heights(*run)) line.push_back({static_cast<double>(line.size()), height});
+    }
+    return out;
+}
+constexpr const char* stroke_meaning = "stroke: lowest to highest seed";
+
+// Fig. 1c, of the runs that have online episodes.
+inline void add_histogram(std::vector<Part>& parts, const Group& group) {
+    svg::Chart chart{group.task + ": lengths of the online episodes", "", "episode length, steps", "episodes per seed"};
     chart.categories.assign(bar_labels.begin(), bar_labels.end());
-    chart.low = 0;
-    std::vector<Row> rows = group.rows;
-    std::erase_if(rows, [](const Row& row) { return row.any().offline_only(); });
-    chart.subtitle = subtitle(group, rows, "stroke");
-    for (const Row& row : rows)
-        chart.series.push_back(mean_series(row.label(), row.colour, row.runs,
-                                           [](const Run& run) { return count_lengths(run.episode_length); }));
-    return {svg::draw_chart(chart),
-            "Compare with fig. 1c of the paper. How many of the episodes met in online training had which length; from "
-            "11 on a bar covers a range of lengths, and 100 is the time limit.",
-            group.file + "-episodes.svg"};
+    const auto counts = [](const Run& run) {
+        return run.episode_length.empty() ? std::vector<double>{} : count_lengths(run.episode_length);
+    };
+    for (const Row& row : group.rows) chart.series.push_back(bars_of(row.label(), row.colour, row.runs, counts));
+    add_chart(parts, group, chart, stroke_meaning,
+              "Compare with fig. 1c of the paper. How many of the episodes met in online training had which length; "
+              "from 11 on a bar covers a range of lengths, and 100 is the time limit.",
+              "episodes");
 }
 
-// Figs. 1d, 4b. `row`: its finished runs.
-inline Figure start_actions(const Group& group, const Row& row) {
+// Figs. 1d, 4b, of finished runs. All such figures of a group have one scale.
+inline void add_start_actions(std::vector<Part>& parts, const Group& group, const Row& row) {
     const Method& method = row.any().about_method();
-    svg::Chart chart{group.task + ": actions at S, " + row.label(), "move", "share"};
-    chart.subtitle = subtitle(group, {row}, "stroke");
-    chart.low = 0;
-    chart.high = 1;
+    svg::Chart chart{group.task + ": actions at S, " + row.label(), "", "move", "share"};
+    for (const Run* run : group.runs)
+        for (const std::vector<double>& shares : run->start_actions)
+            chart.covers.insert(chart.covers.end(), shares.begin(), shares.end());
     for (const GridMove& move : grid_move_table) chart.categories.emplace_back(move.name);
     const std::array<std::pair<const char*, const char*>, 3> shown{
         {{"learned policy", method.colour}, {"D_offline", svg::sky}, {"D_online", svg::purple}}};
     for (size_t k = 0; k < shown.size(); ++k)
-        chart.series.push_back(mean_series(shown[k].first, shown[k].second, row.runs,
-                                           [&](const Run& run) { return run.start_actions[k]; }));
-    return {svg::draw_chart(chart),
-            std::string("Compare with fig. ") + method.start_figure +
-                " of the paper. Finished runs. Share of each move at the start cell S: its probability under the "
-                "learned policy, and its frequency in D_offline and, at the end, in D_online. R, D, L, U: right, down, "
-                "left, up.",
-            group.file + "-start-" + row.file() + ".svg"};
+        chart.series.push_back(
+            bars_of(shown[k].first, shown[k].second, row.runs, [&](const Run& run) { return run.start_actions[k]; }));
+    add_chart(parts, group, chart, stroke_meaning,
+              std::string("Compare with fig. ") + method.start_figure +
+                  " of the paper. Finished runs. Share of each move at the start cell S: its probability under the "
+                  "learned policy, and its frequency in D_offline and, at the end, in D_online. R, D, L, U: right, "
+                  "down, left, up.",
+              "start-" + row.file());
 }
 
 // Fig. 1a shows the shortest path in this way; the paper does not show a learned one.
@@ -654,7 +691,7 @@ inline Figure maze_map(const Group& group, const Row& row, const Run& run) {
 inline long unfinished(const Runs& runs) { return std::ranges::count(runs, false, &Run::finished); }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
-inline std::string compared(const Row& row, Quantity quantity, const PaperResult& paper) {
+inline std::string compared(const Row& row, const Quantity& quantity, const PaperResult& paper) {
     const Spread ours = spread_of(row.runs, final_value, quantity);
     const double difference = ours.mean - paper.mean;
     std::string out = row.label();
@@ -677,7 +714,7 @@ inline std::string verdict(const Group& group) {
     std::string out = group.heading() + ", final " + group.unit + ": ";
     for (const Row& row : std::views::reverse(group.rows))
         out += compared(row, group.quantity, *paper_result(row.any())) + (&row == &group.rows[0] ? "" : "; ");
-    if (const double far = most_interactions(group.runs); far > 0)
+    if (const double far = std::ranges::max(group.runs, {}, &Run::so_far)->so_far; far > 0)
         out +=
             "; online interactions: up to " + svg::grouped(far, 0) + ", paper " + (any.mujoco ? "200,000" : "20,000");
     const auto has_other_data = [](const Run* run) {
@@ -689,19 +726,19 @@ inline std::string verdict(const Group& group) {
 
 // One line for each row: the number of seeds, our results as mean ± deviation over them, and the paper's.
 inline Table method_table(const Group& group) {
-    const bool scores = group.quantity != &Run::length;
+    const bool scores = group.quantity != "eval_length";
     Table table{{"Method", "Seeds", "Final " + group.unit, "Mean of last 10", "Paper", "Final return"}, {}};
     if (scores) table.header.push_back("Final length");
     for (const Row& row : group.rows) {
-        const auto mean = [&](Summary summary, Quantity quantity) {
+        const auto mean = [&](Summary summary, const Quantity& quantity) {
             return plus_minus(spread_of(row.runs, summary, quantity));
         };
         std::string seeds = std::to_string(row.runs.size());
         if (unfinished(row.runs) > 0) seeds += " (" + std::to_string(unfinished(row.runs)) + " unfinished)";
         const PaperResult* paper = paper_result(row.any());
         table.rows.push_back({row.label(), seeds, mean(final_value, group.quantity), mean(last_ten, group.quantity),
-                              paper ? paper->text() : "-", mean(final_value, &Run::total)});
-        if (scores) table.rows.back().push_back(mean(final_value, &Run::length));
+                              paper ? paper->text() : "-", mean(final_value, "eval_return")});
+        if (scores) table.rows.back().push_back(mean(final_value, "eval_length"));
     }
     return table;
 }
@@ -712,15 +749,15 @@ inline Table dose_table(const Group& group) {
                  "Length of the mean shift"},
                 {}};
     for (const Row& row : group.rows) {
-        const auto thousandths = [&](Quantity quantity) {
+        const auto thousandths = [&](const Quantity& quantity) {
             Spread spread = spread_of(row.runs, last_ten, quantity);
             spread.mean *= 1000;
             spread.deviation *= 1000;
             return plus_minus(spread);
         };
-        if (!row.any().advice.empty())
-            table.rows.push_back({row.label(), thousandths(&Run::advice), thousandths(&Run::advice_distance),
-                                  thousandths(&Run::advice_shift)});
+        if (row.any().settings.method == "wodtem" && !row.any().column("advice").empty())
+            table.rows.push_back(
+                {row.label(), thousandths("advice"), thousandths("advice_distance"), thousandths("advice_shift")});
     }
     return table;
 }
@@ -744,6 +781,27 @@ inline Table run_table(const Group& group) {
     return table;
 }
 
+// When and where the runs were made, as far as they say.
+inline Table time_table(const Group& group) {
+    Table table{{"Run", "Last row (UTC)", "Duration", "Updates a second", "Machine", "Program"}, {}, true};
+    for (const Row& row : group.rows)
+        for (const Run* run : row.runs)
+            if (!run->time.empty()) table.rows.emplace_back(run->time)[0] = row.name_of(*run);
+    return table;
+}
+
+// Every setting that is not the same in all rows, those that the presets set apart included.
+inline Table settings_table(const Group& group) {
+    Table table{{"Settings that differ"}, {}, true};
+    for (const Row& row : group.rows) table.header.push_back(row.label());
+    for (const SettingRow& setting : setting_rows) {
+        std::vector<std::string> cells{setting.name};
+        for (const Row& row : group.rows) cells.push_back(setting_text(row.any().settings, setting));
+        if (identifies(setting) && std::set(cells.begin() + 1, cells.end()).size() > 1) table.rows.push_back(cells);
+    }
+    return table;
+}
+
 // One line for each run, with the command that repeats it.
 inline Table command_table(const Group& group) {
     Table table{{"To repeat these runs, each with an --out of its own", "Arithmetic"}, {}};
@@ -759,17 +817,15 @@ inline void add_grid_world(std::vector<Part>& parts, const Group& group) {
     parts.emplace_back(
         "Lengths are in steps. Shortest met: the shortest online episode that reached the goal. At 5 from: the online "
         "interactions of the first evaluation from which on every one took 5 steps, the length of the shortest path "
-        "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps.");
-    parts.emplace_back(curve(group, &Run::length, "Compare with figs. 1b and 4a of the paper."));
-    if (!group.rows.back().any().offline_only()) parts.emplace_back(histogram(group));
-    std::vector<Figure> maps;
+        "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps. Compare "
+        "the first figure with figs. 1b and 4a of the paper.");
+    add_curves(parts, group, [](auto column) { return column == "eval_length"; });
+    for (const Row& row : group.rows) add_start_actions(parts, group, row);
+    add_histogram(parts, group);
     for (Row row : group.rows) {
         std::erase_if(row.runs, [](const Run* run) { return !run->finished; });
-        if (row.runs.empty()) continue;
-        if (!row.any().offline_only()) parts.emplace_back(start_actions(group, row));
-        maps.push_back(policy_map(group, row));
+        if (!row.runs.empty()) parts.emplace_back(policy_map(group, row));
     }
-    parts.insert(parts.end(), maps.begin(), maps.end());
 }
 
 // Any other task: what its numbers rest on, curves, and in mazes one run's paths for each row.
@@ -786,24 +842,42 @@ inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
                        ". Normalised score, as D4RL defines it: linear in the return, 0 for a random policy (" +
                        svg::grouped(task.score_low, 2) + "), 100 for an expert (" + svg::grouped(task.score_high, 2) +
                        "). " + end + svg::grouped(task.max_episode_steps, 0) + " steps.");
-    parts.emplace_back(curve(group, &Run::score, "Mean score of the evaluations."));
     // Where no episode ends early, the length is a flat line.
-    if (ends_early) parts.emplace_back(curve(group, &Run::length, "Mean length of the evaluations."));
+    add_curves(parts, group,
+               [&](auto column) { return column == "eval_score" || (ends_early && column == "eval_length"); });
     for (const Row& row : group.rows) {
         const auto found = std::ranges::find_if(row.runs, [](const Run* run) { return !run->paths.empty(); });
         if (found != row.runs.end()) parts.emplace_back(maze_map(group, row, **found));
     }
 }
 
+// "Updates made, mean over seeds: ODT 42,000; WODTEM 143,000, 3.4 times those of ODT." and what follows from it.
+inline std::string updates_sentence(const Group& group) {
+    std::string out;
+    const Row* first = nullptr;
+    const auto updates = [](const Row& row) { return spread_of(row.runs, final_value, "updates").mean; };
+    for (const Row& row : group.rows) {
+        if (row.any().offline_only() || std::isnan(updates(row))) continue;
+        out += (first ? "; " : "Updates made, mean over seeds: ") + row.label() + " " + svg::grouped(updates(row), 0);
+        if (first) out += ", " + svg::grouped(updates(row) / updates(*first), 1) + " times those of " + first->label();
+        if (!first) first = &row;
+    }
+    return out.empty() ? out
+                       : out +
+                             ". Each online episode is followed by a fixed number of updates, so that shorter "
+                             "episodes make for more updates in the same interactions: compare the curves over "
+                             "updates with those over interactions.";
+}
+
 // The section of runs of one task, preset and physics, sorted as Group says. Errors: report.same_seed.
-inline Section make_section(const Runs& runs) {
+inline Section make_section(const Runs& runs, const std::string& out_folder) {
     const Settings& settings = runs.at(0)->settings;
     const bool mujoco = runs[0]->mujoco != nullptr;
     Group group{runs,
                 settings.task,
                 "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
                 settings.task + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
-                mujoco ? &Run::score : &Run::length,
+                mujoco ? "eval_score" : "eval_length",
                 mujoco ? "normalised score" : "length",
                 rows_of(runs)};
     name_differences(group);
@@ -817,12 +891,22 @@ inline Section make_section(const Runs& runs) {
         section.parts.emplace_back(doses);
     }
     (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);
+    if (const std::string sentence = updates_sentence(group); !sentence.empty()) section.parts.emplace_back(sentence);
+    add_curves(section.parts, group, [](auto column) { return !column.starts_with("eval_"); });
+    for (const Table& table : {settings_table(group), time_table(group)})
+        if (!table.rows.empty()) section.parts.emplace_back(table);
     section.parts.emplace_back(command_table(group));
+    for (const Row& row : group.rows)
+        for (const Run* run : row.runs) {
+            std::error_code error;  // writing the page will fail with a sentence
+            const std::string folder = std::filesystem::relative(run->folder, out_folder, error);
+            section.parts.emplace_back(Files{row.name_of(*run), folder, run->files});
+        }
     return section;
 }
 
 // The introduction, and a section for each group of runs.
-inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
+inline std::vector<Section> make_sections(const std::vector<Run>& runs, const std::string& out_folder) {
     std::map<std::tuple<std::string, std::string, std::string>, Runs> groups;
     for (const Run& run : runs) groups[{run.settings.task, run.settings.preset, run.settings.physics}].push_back(&run);
     const char* const numbers =
@@ -834,14 +918,12 @@ inline std::vector<Section> make_sections(const std::vector<Run>& runs) {
         "\"Agrees\": our mean lies within the paper's standard deviation of the paper's mean (grid world: WODTEM 5, "
         "ODT 6.5 to 7.5).";
     const char* const figures =
-        "Curves: mean over seeds, and a band of one standard deviation to either side, cut off where the quantity "
-        "itself ends; diamonds: the paper's final results. Seeds are evaluated at different interactions; each is "
-        "drawn by its last evaluation until then, and at the right end by its final one. DT has no online phase and "
-        "is a dashed line across. Bars: mean over seeds; strokes: as bands. Unfinished runs count as far as they go, "
-        "so that a curve may jump where one of them ends. The file settings in a run's folder has the value of every "
-        "setting and where it came from.";
+        "Curves: each seed as a thin line, straight between its evaluations, which are dots where they can be told "
+        "apart; the mean of these lines, which ends where the first of them ends; diamonds: the paper's final results. "
+        "DT has no online phase: its evaluation is a dashed line across. Bars: mean over seeds; strokes: from the "
+        "lowest to the highest seed. A run's file settings has the value of every setting and where it came from.";
     std::vector<Section> sections{{"How to read this", {numbers, figures}}};
-    for (const auto& group : groups) sections.push_back(make_section(group.second));
+    for (const auto& group : groups) sections.push_back(make_section(group.second, out_folder));
     return sections;
 }
 
@@ -853,10 +935,11 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     using namespace results;
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
     std::vector<Run> runs;
-    for (const std::string& folder : folders) runs.push_back(read_run(folder));
+    for (const std::string& folder : folders)
+        for (const std::string& one : run_folders(folder)) runs.push_back(read_run(one));
     const auto order = [](const Run& run) { return std::tie(run.method, run.identity, run.settings.seed); };
     std::ranges::stable_sort(runs, {}, order);
-    const std::vector<Section> sections = make_sections(runs);
+    const std::vector<Section> sections = make_sections(runs, out_folder);
 
     std::error_code error;
     std::filesystem::create_directories(out_folder, error);
@@ -866,7 +949,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     for (const Section& section : sections) {
         if (&section != &sections[0]) text += section.heading + "\n\n";  // the first explains the pages
         for (const Part& part : section.parts) {
-            if (const auto* table = std::get_if<Table>(&part)) text += markdown(*table);
+            if (const auto* table = std::get_if<Table>(&part); table && !table->pages_only) text += markdown(*table);
             if (const auto* figure = std::get_if<Figure>(&part))
                 write_file_atomic(out_folder + "/" + figure->file, figure->svg);
         }

@@ -4,6 +4,7 @@
 //   command                  the command that makes this run, with the paths of its data set and first weights
 //   progress.csv             a row for each evaluation        grows
 //   episodes.csv             a row for each online episode    grows
+//   seconds.csv              when each evaluation was made    grows; no part of the state
 //   checkpoint.safetensors   the whole state, while the run is unfinished
 //   model.safetensors        the trained model (model_file.hpp)
 //   policy.csv, start_actions.csv (grid world), paths.csv (mazes): what the report's figures need
@@ -11,12 +12,15 @@
 //   kept.safetensors         with --keep-state: the state before the last evaluation, to go on with a larger budget
 //   budgets                  the smaller budgets of a run that went on, a line each
 //
-// Promises: the checkpoint notes the length and the checksum of both logs, and continuing cuts them back to it, so an
-// interrupted run ends with the same bytes; a folder of other settings is left as it is; one process at a time works in
-// a folder. Leaves out: what the state of a run is (the caller visits it).
+// Promises: the checkpoint notes the length and the checksum of progress.csv and episodes.csv, and continuing cuts them
+// back to it, so an interrupted run ends with the same bytes, but for seconds.csv; a folder of other settings is left as
+// it is; one process at a time works in a folder. Leaves out: what the state of a run is (the caller visits it).
 #pragma once
 
 #include <sys/file.h>
+
+#include <ctime>
+#include <fstream>
 
 #include "../gridworld.hpp"
 #include "../mujoco_env.hpp"
@@ -251,6 +255,55 @@ struct Log {
                 " bytes); restore it, or remove the folder to start anew");
     }
 };
+
+// seconds.csv: a row for each evaluation, and one where a process begins or continues the run. Seconds count the time
+// that was spent on the run, but for what an interrupted process did after its last row. date: UTC.
+struct SecondsLog {
+    std::string path, machine;  // machine: where this process works, without commas
+    double before = 0;          // seconds of the processes that worked on the run before
+    Clock::time_point began = Clock::now();
+
+    // resumed: whether the run goes on, and its rows with it. A row that was cut off is dropped. Errors: run.seconds.
+    void begin(bool resumed, uint64_t updates, uint64_t interactions) {
+        std::string text = resumed && std::filesystem::exists(path) ? read_file(path) : "";
+        text.resize(text.rfind('\n') + 1);
+        const std::vector<std::string> lines = split(text, '\n');  // the last one is empty
+        if (lines.size() < 3) {
+            text = "updates,interactions,seconds,date,machine,program\n";
+        } else {
+            const std::vector<std::string> fields = split(lines[lines.size() - 2], ',');
+            const std::optional<double> seconds = fields.size() == 6 ? to_number(fields[2]) : std::nullopt;
+            require(seconds && *seconds >= 0 && *seconds < 1e12, "run.seconds", path,
+                    ": its last line has no seconds; remove the file, which only the report's durations come from");
+            before = *seconds;
+        }
+        write_file_atomic(path, text);
+        began = Clock::now();
+        write_row(updates, interactions, before);
+    }
+    void append(uint64_t updates, uint64_t interactions) const {
+        write_row(updates, interactions, before + seconds_since(began));
+    }
+    void write_row(uint64_t updates, uint64_t interactions, double elapsed) const {
+        const std::time_t now = std::time(nullptr);
+        char seconds[32], date[32];
+        std::snprintf(seconds, sizeof seconds, "%.3f", elapsed);
+        std::strftime(date, sizeof date, "%Y-%m-%dT%H:%M:%SZ", std::gmtime(&now));
+        AppendFile(path).write(csv_line(updates, interactions, seconds, date, machine,
+                                        std::string(checkpoint_format) + "; g++ " + __VERSION__));
+    }
+};
+
+// "Intel Xeon; kernel avx512 fp32; threads 2"; no commas.
+inline std::string machine_text(const Kernel& kernel, int threads) {
+    std::string processor = "unknown processor";
+    std::ifstream file("/proc/cpuinfo");
+    for (std::string line; std::getline(file, line);)
+        if (line.starts_with("model name") && line.find(": ") != std::string::npos)
+            processor = line.substr(line.find(": ") + 2);
+    std::erase(processor, ',');
+    return processor + "; kernel " + kernel.name + " " + kernel.precision + "; threads " + std::to_string(threads);
+}
 
 struct RunFolder {
     std::string path;

@@ -471,60 +471,114 @@ TEST(numbers_and_text_are_written_for_xml_and_readers) {
     CHECK(!well_formed("<a>") && !well_formed("<a></b>") && !well_formed("a & b") && !well_formed("<a b=\"/>"));
 }
 
-TEST(line_chart_breaks_at_missing_values) {
+// Against a search through all pieces of all lines. A line may have several points at one x: the last counts.
+TEST(the_mean_of_lines_is_drawn_where_all_of_them_go) {
+    const Random random{test_seed(), 11};
+    for (uint32_t trial = 0; trial < 300; ++trial) {
+        std::vector<svg::Line> lines(1 + trial % 4);
+        double first = 0, last = INFINITY;
+        for (uint32_t k = 0; k < lines.size(); ++k) {
+            double x = std::floor(4 * random.uniform(trial, 100 * k));
+            for (uint32_t i = 0; i < 1 + trial % 7; ++i) {
+                lines[k].push_back({x, random.uniform(trial, 100 * k + 2 * i + 1)});
+                x += std::floor(3 * random.uniform(trial, 100 * k + 2 * i + 2));
+            }
+            first = std::max(first, lines[k].front().x);
+            last = std::min(last, lines[k].back().x);
+        }
+        const auto mean_at = [&](double x) {
+            double sum = 0;
+            for (const svg::Line& line : lines) {
+                double height = NAN;
+                for (size_t i = 0; i + 1 < line.size(); ++i) {
+                    const double share = (x - line[i].x) / (line[i + 1].x - line[i].x);
+                    if (share >= 0 && share <= 1) height = (1 - share) * line[i].y + share * line[i + 1].y;
+                }
+                for (const svg::Point& p : line)
+                    if (p.x == x) height = p.y;
+                sum += height;
+            }
+            return sum / static_cast<double>(lines.size());
+        };
+        const svg::Line mean = svg::mean_of(lines);
+        std::set<double> expected, found;
+        for (const svg::Line& line : lines)
+            for (const svg::Point& p : line)
+                if (p.x >= first && p.x <= last) expected.insert(p.x);
+        for (const svg::Point& p : mean) {
+            found.insert(p.x);
+            CHECK_CLOSE(p.y, mean_at(p.x), 1e-12);
+        }
+        CHECK(found == expected && mean.size() == expected.size());
+    }
+    CHECK(svg::mean_of({}).empty() && svg::mean_of({{{0, 1}}, {{1, 1}}}).empty());
+}
+
+TEST(line_chart_leaves_out_what_is_no_number) {
     const double no = not_measured;
-    svg::Chart chart{"R & D <1>", "steps", "length", {0, 1, 2, 3, 4, 5, 6}, {}, {}, {{"best: 5", svg::black, 5}}};
-    chart.series.push_back({"a", svg::blue, {9, 8, no, no, 7, no, 6}, {no, no, no, no, no, no, no}});
-    chart.series.push_back({"b", svg::green, {9, 1e300, no, no, no, no, no}, {1, no, no, no, no, no, no}});
+    svg::Chart chart{"R & D <1>", "", "steps", "length", {}, {}, {{"best: 5", svg::black, 5}}};
+    chart.series.push_back({"a", svg::blue, {{{0, 9}, {1, no}, {2, 7}, {1e300, 7}}, {{0, 8}, {2, 8}}, {{1, no}}, {}}});
+    chart.series.push_back({"b", svg::green, {{{0, 9}, {1, 1e300}}}});
+    chart.series.push_back({"none", svg::purple, {{{0, no}}, {}}});
     const std::string svg = svg::draw_chart(chart);
     check_figure(svg);
-    CHECK_EQUAL(count(svg, "fill-opacity"), size_t{4});          // pieces: 0-1, 4, 6 and the one point of b
-    CHECK_EQUAL(count(svg, "<circle"), size_t{4});               // a dot ends each
+    CHECK_EQUAL(count(svg, "stroke-opacity"), size_t{2});        // a's lines; b has one, which is its mean
+    CHECK_EQUAL(count(svg, "h 0 "), size_t{5});                  // dots
+    CHECK_EQUAL(count(svg, "stroke-width=\"2.5\""), size_t{4});  // means, and in the legend
+    CHECK_EQUAL(count(svg, ">a<") + count(svg, ">b<"), size_t{2});
+    CHECK_EQUAL(count(svg, ">none<") + count(svg, svg::purple), size_t{0});
     CHECK_EQUAL(count(svg, "Z\" fill=\"#000000\""), size_t{2});  // the mark, and the legend's
     CHECK_EQUAL(count(svg, "R &amp; D &lt;1&gt;"), size_t{2});
     CHECK_EQUAL(svg::draw_chart(chart), svg);
-    check_figure(svg::draw_chart({"nothing yet", "x", "y"}));
+    check_figure(svg::draw_chart({"nothing yet", "", "x", "y"}));
     for (const double value : {0.0, no, 1e300, -1e300, 9e14}) {
-        chart.series = {{"a", svg::blue, std::vector<double>(7, value), std::vector<double>(7, value)}};
+        chart.series = {{"a", svg::blue, {{{0, value}, {1, value}}, {{0, -value}, {2, value}}}}};
         chart.marks[0].value = value;
+        chart.covers = {value};
+        check_figure(svg::draw_chart(chart));
+        chart.series[0].level = true;
         check_figure(svg::draw_chart(chart));
     }
-    chart.series[0].mean.pop_back();
-    CHECK_FAILS("figure.length", svg::draw_chart(chart));
-    chart.series = {{"a", svg::blue, std::vector<double>(7, 1), {}}};
-    CHECK_FAILS("figure.length", svg::draw_chart(chart));
+    chart.series = {{"a", svg::blue, {{}}}};
+    for (int i = 0; i < 121; ++i) chart.series[0].lines[0].push_back({static_cast<double>(i), 1});
+    CHECK_EQUAL(count(svg::draw_chart(chart), "h 0 "), size_t{0});  // too many to be told apart
 }
 
 TEST(line_chart_ends_with_the_data_and_places_points_by_hand) {
     // The y axis is 0..10 on 350..50; its labels are at most two digits wide, so x = 0 lies at 50 + 26 * 0.61.
-    svg::Chart chart{"t", "x", "y", {0, 20700}, {}, {{"a", svg::blue, {2, 10}, {3, 2}}}, {{"m", svg::green, 5}}, 0, 10};
-    chart.subtitle = "r & s";
+    svg::Chart chart{"t", "r & s", "x", "y", {}, {{"a", svg::blue, {{{0, 2}, {20700, 10}}, {{0, 4}, {10350, 0}}}}}};
+    chart.marks = {{"m", svg::green, 5}};
+    chart.series.push_back({"level", svg::green, {{{7, 1}}, {{9, 3}}}, true});
     const std::string svg = svg::draw_chart(chart);
     check_figure(svg);
     CHECK_EQUAL(count(svg, "r &amp; s"), size_t{2});
     CHECK_EQUAL(count(svg, ">20,000<"), size_t{1});
     CHECK_EQUAL(count(svg, ">25,000<"), size_t{0});
     CHECK_EQUAL(count(svg, "d=\"M 65.86 290 680 50 \""), size_t{1});
-    CHECK_EQUAL(count(svg, "d=\"M 65.86 200 680 50 680 110 65.86 350 Z\""), size_t{1});  // the band ends at 0 and 10
-    CHECK_EQUAL(count(svg, "d=\"M 683 200 688 193 693 200 688 207 Z\""), size_t{1});     // the mark beside the plot
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 290 h 0 M 680 50 h 0 \""), size_t{1});
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 230 372.93 350 \""), size_t{1});
+    CHECK_EQUAL(count(svg, "d=\"M 65.86 260 372.93 260 \""),
+                size_t{1});                          // means 3 and 3, to where the second line ends
+    for (const char* level : {"320", "260", "290"})  // heights 1 and 3, and their mean
+        CHECK_EQUAL(count(svg, std::string("d=\"M 65.86 ") + level + " 680 " + level + " \""), size_t{1});
+    CHECK_EQUAL(count(svg, "stroke-dasharray"), size_t{4});                           // those, and the legend's
+    CHECK_EQUAL(count(svg, "d=\"M 683 200 688 193 693 200 688 207 Z\""), size_t{1});  // the mark beside the plot
+    chart.covers = {50};
+    CHECK_EQUAL(count(svg::draw_chart(chart), "d=\"M 65.86 338 680 290 \""), size_t{1});  // on an axis of 0..50
 }
 
 TEST(bar_chart_draws_one_bar_per_number) {
-    svg::Chart chart{"t", "x", "y", {}, {"R", "D", "R-D"}, {{"a", svg::blue, {1, not_measured, 70}, {0.5, 1, 2}}}, {}};
+    svg::Chart chart{"t", "", "x", "y", {"R", "D", "R-D"}};
+    chart.series = {{"a", svg::blue, {{{0, 1}, {1, not_measured}, {2, 68}}, {{0, 1}, {1, not_measured}, {2, 72}}}}};
+    chart.series.push_back({"none", svg::green, {{}, {{0, not_measured}}}});
     const std::string svg = svg::draw_chart(chart);
     check_figure(svg);
     CHECK_EQUAL(count(svg, "<rect"), size_t{4});               // background, two bars, legend
-    CHECK_EQUAL(count(svg, "stroke=\"#222222\""), size_t{2});  // and their strokes
+    CHECK_EQUAL(count(svg, "stroke=\"#222222\""), size_t{1});  // the stroke of the bar whose values differ
     CHECK_EQUAL(count(svg, "y=\"87.5\""), size_t{1});          // 70 of 80 on 350..50
     CHECK_EQUAL(count(svg, "height=\"262.5\""), size_t{1});
     CHECK_EQUAL(count(svg, "y1=\"80\"") + count(svg, "y2=\"95\""), size_t{2});  // 72 and 68
     for (const char* label : {">R<", ">D<", ">R-D<"}) CHECK_EQUAL(count(svg, label), size_t{1});
-    chart.low = 69;
-    chart.high = 70;
-    const std::string cut = svg::draw_chart(chart);
-    CHECK_EQUAL(count(cut, "y1=\"50\" x2=\"571.09\" y2=\"54.29\""), size_t{1});  // 70 and 69 of 70
-    chart.series[0].deviation.pop_back();
-    CHECK_FAILS("figure.length", svg::draw_chart(chart));
 }
 
 TEST(legend_begins_a_new_row_before_the_edge) {
@@ -584,8 +638,9 @@ TEST(map_draws_paths_with_their_ends_and_circles) {
 
 TEST(pages_are_one_well_formed_file_and_aligned_markdown) {
     const Table table{{"method", "a|b"}, {{"<ODT>", "7"}, {"\u00b1", "1,000"}}};
-    const Figure figure{svg::draw_chart({"t", "x", "y"}), "c", "t.svg"};
-    const std::vector<Section> sections{{"h", {"p < q", table, figure}, "as in the paper"}};
+    const Figure figure{svg::draw_chart({"t", "", "x", "y"}), "c", "t.svg"};
+    const Files files{"<run>", "../a b#", {"x.csv", "y"}};
+    const std::vector<Section> sections{{"h", {"p < q", table, figure, files}, "as in the paper"}};
     const std::string html = html_page("A & B", sections);
     CHECK(html.starts_with("<!DOCTYPE html>"));
     CHECK(well_formed(html));  // the style sheet has no tags, void elements are closed
@@ -595,5 +650,7 @@ TEST(pages_are_one_well_formed_file_and_aligned_markdown) {
     CHECK_EQUAL(page(Markdown{}, "A & B", sections),
                 "# A & B\n\nas in the paper\n\n## h\n\np < q\n\n"
                 "| method |  a\\|b |\n| ------ | ----: |\n| <ODT>  |     7 |\n| \u00b1      | 1,000 |\n\n"
-                "![](t.svg)\n\nc\n\n");
+                "![](t.svg)\n\nc\n\n<run>: [x.csv](../a%20b%23/x.csv) [y](../a%20b%23/y)\n\n");
+    CHECK_EQUAL(count(html, "&lt;run&gt;: <a href=\"../a%20b%23/x.csv\">x.csv</a> <a href="), size_t{1});
+    CHECK_EQUAL(url_of("50%<\"(&)\">?"), "50%25%3C%22%28%26%29%22%3E%3F");
 }

@@ -106,8 +106,7 @@ std::string write_mujoco_run(const std::string& parent, const std::string& task,
 
 Run run_with(const std::vector<double>& interactions, const std::vector<double>& length, bool finished) {
     Run run;
-    run.interactions = interactions;
-    run.length = length;
+    run.progress = {{"interactions", interactions}, {"eval_length", length}};
     run.finished = finished;
     run.so_far = interactions.back();
     return run;
@@ -171,29 +170,10 @@ TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
     CHECK_EQUAL(plus_minus(spread_of({none})), "-");
 }
 
-TEST(resampling_takes_the_last_evaluation_at_or_before_each_point) {
-    const Run run = run_with({0, 240, 250, 600, 760, 1010}, {50, 40, 30, 20, none, 10}, true);
-    CHECK(equal(curve_points({&run}), {0, 250, 500, 750, 1000}));
-    const Run offline = run_with({0}, {50}, true), long_one = run_with({200000}, {50}, true);
-    CHECK(equal(curve_points({&offline}), {0, 250}));
-    CHECK_EQUAL(curve_points({&long_one})[1], 500.0);
-    // 760 has no value; 1010 is the final one and shows at the last point
-    CHECK(equal(resampled(run, &Run::length, {0, 249, 250, 500, 750, 900, 1000}), {50, 40, 30, 30, 20, 20, 10}));
-}
-
-TEST(unfinished_run_ends_where_it_stands_and_finished_one_keeps_its_last_value) {
-    const Run open = run_with({0, 260}, {9, 8}, false), done = run_with({0, 260}, {9, 8}, true);
-    CHECK(equal(resampled(open, &Run::length, {0, 250, 260, 500}), {9, 9, 8, none}));
-    CHECK(equal(resampled(done, &Run::length, {0, 250, 260, 500}), {9, 9, 8, 8}));
-    const Run a = run_with({0, 1}, {4, 6}, true), b = run_with({0, 1}, {8, none}, true);
-    const svg::Series both = mean_series("", "", {&a, &b}, [](const Run& run) { return run.length; });
-    CHECK(equal(both.mean, {6, 6}) && equal(both.deviation, {std::sqrt(8.0), none}));
-}
-
 TEST(mean_of_last_ten_passes_over_missing_values) {
-    CHECK_CLOSE(last_ten(run_with({0}, {90, 1, 2, 3, 4, 5, none, 6, 7, 8, 9, 10}, true), &Run::length), 5.5, 1e-12);
-    CHECK_CLOSE(last_ten(run_with({0}, {4, 6}, true), &Run::length), 5, 0);
-    CHECK(std::isnan(last_ten(run_with({0}, {none}, true), &Run::length)));
+    CHECK_CLOSE(last_ten(run_with({0}, {90, 1, 2, 3, 4, 5, none, 6, 7, 8, 9, 10}, true), "eval_length"), 5.5, 1e-12);
+    CHECK_CLOSE(last_ten(run_with({0}, {4, 6}, true), "eval_length"), 5, 0);
+    CHECK(std::isnan(last_ten(run_with({0}, {none}, true), "eval_length")));
 }
 
 TEST(length_five_counts_from_the_evaluation_after_which_it_never_left) {
@@ -282,13 +262,15 @@ TEST(report_states_what_the_folders_hold) {
     }
     CHECK_CONTAINS(page, "These moves reach G. Moves: 5. Moves off the grid: clipped.");
     CHECK_CONTAINS(page, "These moves do not reach G, but return to a visited cell. Moves: 5.");
-    // The curve has three lines with bands, and the paper's marks of ODT and WODTEM; each has an entry in the legend.
+    // The curve has three means, above the lines of three and two seeds, and the paper's marks of ODT and WODTEM; each
+    // mean and mark has an entry in the legend.
     const std::string curve = read_file(out + "/gridworld-paper-length.svg");
-    CHECK_EQUAL(count(curve, "fill-opacity"), size_t{3});
+    CHECK_EQUAL(count(curve, "stroke-width=\"2.5\""), size_t{3 + 3});  // in the legend too
+    CHECK_EQUAL(count(curve, "stroke-opacity"), size_t{3 + 2});
     CHECK_EQUAL(count(curve, ">paper: "), size_t{2});
     CHECK_EQUAL(count(curve, "stroke-dasharray"), size_t{2});  // DT's, and in the legend
     CHECK_EQUAL(count(curve, ">DT<") + count(curve, ">ODT<") + count(curve, ">WODTEM (alpha=0.5)<"), size_t{3});
-    CHECK_CONTAINS(curve, "mean over n = 1 to 3 seeds; band: one standard deviation to either side<");
+    CHECK_CONTAINS(curve, "mean over n = 1 to 3 seeds; thin lines: each seed<");
 
     // Every row of a table has a cell for each column of its header.
     size_t cells = 0, rows = 0;
@@ -297,7 +279,14 @@ TEST(report_states_what_the_folders_hold) {
         cells = count(line, "|");
         rows += cells > 0;
     }
-    CHECK_EQUAL(rows, size_t{(2 + 3) + (2 + 6) + (2 + 6)});  // two lines of a header, then the methods or the runs
+    // Two lines of a header, then the methods, the runs, the settings that differ, the commands.
+    CHECK_EQUAL(rows, size_t{(2 + 3) + (2 + 6) + (2 + 3) + (2 + 6)});
+    for (const char* row :
+         {"| Settings that differ | DT | ODT | WODTEM (alpha=0.5) |", "| method | dt | odt | wodtem |",
+          "| online_steps | 0 | 20000 | 20000 |", "| alpha | 0.75 | 0.75 | 0.5 |"}) {
+        CHECK_CONTAINS(markdown, row);
+        CHECK_EQUAL(count(narrow(text), row), size_t{0});  // on the pages alone
+    }
 
     std::reverse(folders.begin(), folders.end());  // the order of the arguments does not matter
     report(folders, out);
@@ -405,6 +394,9 @@ TEST(the_dose_is_shown_in_thousandths_where_it_was_logged) {
     const std::string page = read_file(scratch.path + "/report/report.md");
     CHECK(narrow(page).find("| WODTEM | 25.00 ± 7.07 | 10.00 ± 0.00 | 1.00 ± 0.71 |") != std::string::npos);
     CHECK(page.find("| ODT | 25") == std::string::npos);
+    const std::string header = "interactions,eval_length,eval_return,eval_score,advice,advice_distance,advice_shift\n";
+    write(folders[3], "progress.csv",
+          header + "0,6,1,1,nan,nan,nan\n9,6,1,1,nan,nan,nan\n");  // of a method without one
     report({folders[3]}, scratch.path + "/report");
     CHECK(read_file(scratch.path + "/report/report.md").find("dose") == std::string::npos);
 }
@@ -441,10 +433,10 @@ TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
          "![](hopper-medium-v2-paper-score.svg)"})
         CHECK_CONTAINS(page, part);
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-score.svg"), ">normalised score<");
-    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-length.svg"), ">evaluation length, steps<");
+    CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-length.svg"),
+                   ">hopper-medium-v2: evaluation length over online interactions<");
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-score.svg"),
-                   ">preset paper, physics d4rl; mean over n = 1 to 2 seeds; band: one standard deviation to either "
-                   "side<");
+                   ">preset paper, physics d4rl; mean over n = 1 to 2 seeds; thin lines: each seed<");
 }
 
 TEST(physics_are_never_mixed) {
@@ -545,25 +537,139 @@ TEST(an_ablation_has_a_row_and_a_line_for_each_value) {
     for (const char* line : {">ODT<", ">WODTEM (alpha=0.5)<", ">WODTEM (alpha=0.75)<", ">WODTEM (alpha=0.9)<"})
         CHECK_EQUAL(count(curve, line), size_t{1});
     for (const char* colour : {svg::blue, svg::vermillion, svg::purple, "#E69F00"})
-        CHECK_EQUAL(count(curve, std::string("stroke=\"") + colour), size_t{2});  // the line, and the legend's
-    CHECK_EQUAL(count(curve, ">paper: "), size_t{2});                             // one of each method
+        CHECK_EQUAL(count(curve, std::string("stroke=\"") + colour + "\" stroke-width=\"2.5\""),
+                    size_t{2});                        // and the legend's
+    CHECK_EQUAL(count(curve, ">paper: "), size_t{2});  // one of each method
     for (const char* file : {"wodtem", "wodtem-2", "wodtem-3", "odt"})
         CHECK_CONTAINS(read_file(out + "/report.md"), "(gridworld-paper-grid-" + (file + std::string(".svg)")));
     CHECK_CONTAINS(read_file(out + "/gridworld-paper-grid-wodtem-3.svg"), "WODTEM (alpha=0.9) seed 0<");
 }
 
-TEST(bands_end_where_the_quantity_ends) {
+TEST(curves_join_evaluations_and_show_nothing_that_no_seed_reached) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", curve = out + "/gridworld-paper-length.svg";
+    const std::string first = write_run(temporary.path, "odt", 0, {{0, 100}, {250, 6}});
+    report({first, write_run(temporary.path, "odt", 1, {{0, 20}, {250, 40}})}, out);
+    // On an axis of 0 to 100 steps, 3 units each; x = 0 lies at 50 + 39 * 0.61 = 73.79, 250 at 680.
+    for (const char* line : {"M 73.79 50 680 332 ", "M 73.79 290 680 230 ", "M 73.79 170 680 281 "})
+        CHECK_EQUAL(count(read_file(curve), line), size_t{1});  // the seeds, and their mean: 60 and 23
+    CHECK_EQUAL(count(read_file(curve), "fill-opacity"), size_t{0});
+    // The mean ends with the seed that is behind: there the other one has come half of the way from 100 to 6.
+    const std::string second = write_run(temporary.path, "odt", 1, {{0, 20}, {125, 40}});
+    std::filesystem::remove(second + "/finished");
+    report({first, second}, out);
+    CHECK_EQUAL(count(read_file(curve), "\"M 73.79 170 376.89 210.5 \""), size_t{1});
+}
+
+TEST(training_is_drawn_over_updates_and_compared_in_a_sentence) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", name = out + "/gridworld-paper-";
+    const auto run = [&](const char* method, int seed, const std::string& rows) {
+        const std::string folder = write_run(temporary.path, method, seed, {{0, 100}});
+        write(folder, "progress.csv",
+              "updates,interactions,eval_length,eval_return,eval_score,loss,entropy,lambda,gradient_norm,short,"
+              "rollout_return\n" +
+                  rows);
+        return folder;
+    };
+    const std::vector<std::string> folders{
+        run("dt", 0, "1000,0,9,1,1,5,nan,nan,1,nan,nan\n"),
+        run("odt", 0, "1000,0,100,0,0,3,1,0.1,1,nan,nan\n2000,500,7,1,1,2,1,0.1,1,nan,0\n"),
+        run("wodtem", 0, "1000,0,100,0,0,3,1,0.1,1,0.9,nan\n7000,500,5,1,1,1,1,0.1,1,0.5,1\n"),
+        run("wodtem", 1, "1000,0,100,0,0,3,1,0.1,1,0.9,nan\n9000,500,5,1,1,1,1,0.1,1,0.5,1\n")};
+    report({run("wodtem", 2, "1000,0,100,0,0,3,1,0.1,inf,0.9,nan\n7000,500,5,1,1,1,1,0.1,1e200,0.5,1\n")}, out);
+    CHECK(!std::filesystem::exists(name + "gradient.svg"));  // nothing that can be drawn
+    report(folders, out);
+    CHECK_CONTAINS(read_file(out + "/report.md"),
+                   "Updates made, mean over seeds: ODT 2,000; WODTEM 8,000, 4.0 times those of ODT. ");
+    const auto shown = [&](const char* figure, const char* label) {
+        return count(read_file(name + figure + ".svg"), std::string(">") + label + "<");
+    };
+    for (const char* figure : {"length-updates", "loss", "entropy", "lambda", "gradient", "short", "rollouts"}) {
+        CHECK_CONTAINS(read_file(out + "/report.html"), read_file(name + figure + ".svg"));
+        CHECK_EQUAL(shown(figure, "WODTEM"), size_t{1});
+        CHECK_EQUAL(shown(figure, "ODT"), std::string(figure) == "short" ? size_t{0} : size_t{1});
+        CHECK_EQUAL(shown(figure, "DT"), std::string(figure) == "length-updates" ? size_t{1} : size_t{0});
+    }
+    CHECK_CONTAINS(read_file(name + "loss.svg"), ">preset paper; mean over n = 1 to 2 seeds; thin lines: each seed<");
+    // Losses on 0..3, labels of 3 characters: from update 1,000 of 9,000 at 73.79 + 67.36, loss 3, to 9,000, loss 1.
+    CHECK_EQUAL(count(read_file(name + "loss.svg"), "M 141.15 50 680 250 "), size_t{1});
+    write(folders[1], "progress.csv",
+          "updates,interactions,eval_length,eval_return,eval_score\n9,0,9,1,1\n8,9,9,1,1\n");
+    CHECK_FAILS("csv.order", report({folders[1]}, out));
+    const std::string old = write_run(temporary.path, "odt", 5, {{0, 9}, {9, 9}});  // which logged less
+    report({old}, temporary.path + "/old");
+    CHECK(std::filesystem::exists(temporary.path + "/old/gridworld-paper-length.svg"));
+    for (const char* figure : {"length-updates", "loss", "rollouts"})
+        CHECK(!std::filesystem::exists(temporary.path + "/old/gridworld-paper-" + figure + ".svg"));
+    CHECK_EQUAL(count(read_file(temporary.path + "/old/report.md"), "Updates made"), size_t{0});
+}
+
+TEST(bars_stand_on_one_scale_and_only_where_there_are_runs) {
     const TemporaryFolder temporary;
     const std::string out = temporary.path + "/out";
-    report({write_run(temporary.path, "odt", 0, {{0, 100}, {250, 6}}),
-            write_run(temporary.path, "odt", 1, {{0, 20}, {250, 40}})},
-           out);
-    // Means 60 and 23 with deviations 57 and 24: the band is 5 to 100, then 5 to 47, on an axis of 0 to 100.
-    CHECK_CONTAINS(read_file(out + "/gridworld-paper-length.svg"), " 50 680 208.88 680 335 73.79 335 Z\"");
-    report({write_mujoco_run(temporary.path, "antmaze-umaze-v2", "odt", 0, {{0, 700, 1, 100}}),
-            write_mujoco_run(temporary.path, "antmaze-umaze-v2", "odt", 1, {{0, 700, 0, 0}})},
-           out);
-    CHECK_CONTAINS(read_file(out + "/antmaze-umaze-v2-paper-score.svg"), " 50 680 50 680 350 73.79 350 Z\"");
+    const std::string odt = write_run(temporary.path, "odt", 0, {{0, 9}, {90, 5}});
+    const std::string wodtem = write_run(temporary.path, "wodtem", 0, {{0, 9}, {90, 5}});
+    std::string start = "move,learned,offline,online\n";
+    for (const GridMove& m : grid_move_table)
+        start += m.name + std::string(m.name[0] == 'U' ? ",0.9" : ",0") + ",0,nan\n";
+    write(wodtem, "start_actions.csv", start);
+    write(wodtem, "episodes.csv", "episode,interactions,length,return\n");
+    report({odt, wodtem}, out);
+    const std::string a = read_file(out + "/gridworld-paper-start-odt.svg"),
+                      b = read_file(out + "/gridworld-paper-start-wodtem.svg"),
+                      episodes = read_file(out + "/gridworld-paper-episodes.svg");
+    CHECK_EQUAL(count(a, ">1.0<") + count(b, ">1.0<"), size_t{2});  // the top of both axes
+    CHECK_EQUAL(count(a, "height=\"37.5\""), size_t{3 * 8});        // 0.125 of 300
+    CHECK_EQUAL(count(b, "height=\"270\""), size_t{1});
+    CHECK_EQUAL(count(a, ">D_online<"), size_t{1});
+    CHECK_EQUAL(count(b, ">D_online<"), size_t{0});
+    CHECK_EQUAL(count(episodes, ">ODT<"), size_t{1});
+    CHECK_EQUAL(count(episodes, ">WODTEM<"), size_t{0});
+}
+
+TEST(a_folder_of_runs_stands_for_the_runs_directly_below_it) {
+    const TemporaryFolder temporary;
+    const std::string runs = temporary.path + "/runs", out = runs + "/report";
+    const std::string a = write_run(runs, "odt", 0, {{0, 9}, {90, 5}}), b = write_run(runs, "dt", 0, {{0, 9}});
+    write_run(runs + "/deeper", "odt", 1, {{0, 9}, {90, 5}});
+    write(runs, "notes", "no folder");
+    const std::string text = report({a, b}, out);
+    const std::string page = read_file(out + "/report.html");
+    CHECK_EQUAL(report({runs}, out), text);
+    CHECK(read_file(out + "/report.html") == page);
+    report({runs, runs + "/deeper"}, out);
+    CHECK_CONTAINS(read_file(out + "/report.md"), "# WODTEM: report on 3 runs\n");
+    for (const std::string& none_there : {temporary.path, runs + "/notes", runs + "/missing"})
+        CHECK_FAILS("report.folder", report({none_there}, out));
+    CHECK_FAILS("report.same_seed", report({runs, a}, out));
+}
+
+TEST(pages_link_the_files_of_a_run_and_say_when_and_where_it_was_made) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", header = "updates,interactions,seconds,date,machine,program\n";
+    const std::string run = write_run(temporary.path, "odt", 0, {{0, 9}, {90, 5}});
+    // 1,000 updates in 20 s; killed, continued at update 900: 4,100 updates in 55 s.
+    write(run, "seconds.csv",
+          header + "0,0,0.000,a,m,p\n1000,50,20.000,b,m,p\n900,40,20.000,c,m,p\n5000,90,75.000,d,<m>,q\n");
+    const std::string text = report({run}, out), page = read_file(out + "/report.html");
+    CHECK_CONTAINS(narrow(read_file(out + "/report.md")), "| ODT seed 0 | d | 1:15 | 68 | <m> | q |");
+    CHECK_CONTAINS(page, "<td>&lt;m&gt;</td>");
+    CHECK_EQUAL(count(text, "Updates a second") + count(text, "seconds.csv"), size_t{0});
+    CHECK_CONTAINS(page, "ODT seed 0: <a href=\"../odt-0/settings\">settings</a> <a href=\"../odt-0/progress.csv\">");
+    CHECK_CONTAINS(read_file(out + "/report.md"), " [seconds.csv](../odt-0/seconds.csv)\n");
+    CHECK_EQUAL(count(page, "/command\""), size_t{0});  // this folder has none
+    write(run, "seconds.csv", header + "0,0,0.000,a,m,p\n");
+    report({run}, out);
+    CHECK_CONTAINS(narrow(read_file(out + "/report.md")), "| ODT seed 0 | a | 0:00 | - | m | p |");
+    write(run, "seconds.csv", header);
+    report({run}, out);
+    CHECK_EQUAL(count(read_file(out + "/report.md"), "Updates a second"), size_t{0});
+    for (const auto& [id, rows] :
+         {std::pair("csv.order", "0,0,5,a,m,p\n9,0,4,a,m,p\n"), {"csv.number", "0,0,x,a,m,p\n"}}) {
+        write(run, "seconds.csv", header + rows);
+        CHECK_FAILS(id, report({run}, out));
+    }
 }
 
 // The command in a report's only table of commands with one run.
@@ -671,8 +777,7 @@ TEST(report_draws_the_paths_through_a_maze) {
     const std::string ant_maze = read_file(out + "/antmaze-umaze-v2-paper-paths-wodtem.svg");
     CHECK_EQUAL(count(ant_maze, "d=\"M 384 244 216 421.6 \""), size_t{10});
     CHECK_CONTAINS(ant_maze, ">preset paper, physics d4rl; one run, of n = 1 seed<");
-    CHECK_CONTAINS(read_file(out + "/antmaze-umaze-v2-paper-score.svg"),
-                   ">preset paper, physics d4rl; n = 1 seed, so no band<");
+    CHECK_CONTAINS(read_file(out + "/antmaze-umaze-v2-paper-score.svg"), ">preset paper, physics d4rl; n = 1 seed<");
     CHECK_CONTAINS(ant_maze, "<circle cx=\"211.2\" cy=\"421.6\" r=\"12\"");  // (0.8, 8.4): row 3.1, column 1.2
     CHECK_EQUAL(count(ant_maze, "r=\"12\""), size_t{10});
     CHECK_CONTAINS(
@@ -721,7 +826,7 @@ TEST(report_names_each_way_a_folder_can_be_wrong) {
     const TemporaryFolder temporary;
     const std::string out = temporary.path + "/out", good = write_run(temporary.path, "odt", 0, {{0, 9}, {90, 5}});
     CHECK_FAILS("report.nothing", report({}, out));
-    CHECK_FAILS("report.folder", report({temporary.path}, out));
+    CHECK_FAILS("report.folder", report({temporary.path + "/odt-0/settings"}, out));
     CHECK_FAILS("report.same_seed", report({good, good + "/"}, out));
     CHECK_FAILS("report.write", report({good}, good + "/settings/out"));
 

@@ -1528,6 +1528,33 @@ TEST(a_models_table_size_costs_evaluation_nothing) {
                 "gridworld");
 }
 
+TEST(seconds_go_on_where_a_run_is_continued) {
+    const Scratch scratch;
+    const std::string run = scratch / "run", path = run + "/seconds.csv";
+    const auto rows = [&] { return results::Log(path).table.rows; };
+    const auto seconds = [&] { return results::Log(path).counts("seconds"); };  // which never fall
+    train_until(tiny_settings("wodtem"), run, 20000);                           // in the online phase
+    const std::vector<std::vector<std::string>> before = rows();
+    CHECK_EQUAL(before[0][0] + " " + before[0][1] + " " + before[0][2], "0 0 0.000");
+    CHECK(before.size() >= 2 && seconds().back() > 0);
+    const std::string kept = read_file(path);
+    write_file_atomic(path, kept + "999,999,9.0");  // a row that was cut off
+    train_until(tiny_settings("wodtem"), run, 400);
+    CHECK(read_file(path).starts_with(kept + rows()[before.size()][0] + ","));
+    CHECK_EQUAL(rows()[before.size()][2], before.back()[2]);  // nothing has been done yet by the process that goes on
+    write_file_atomic(path, kept + "999,999,x,d,m,p\n");
+    CHECK_FAILS("run.seconds", quiet_train(tiny_settings("wodtem"), run));
+    fs::remove(path);
+    quiet_train(tiny_settings("wodtem"), run);
+    CHECK(rows()[0][0] != "0" && rows()[0][2] == "0.000");  // counts from here on
+    const Table progress = results::Log(run + "/progress.csv").table;
+    CHECK_EQUAL(rows().back()[0] + " " + rows().back()[1], progress.rows.back()[1] + " " + progress.rows.back()[2]);
+    CHECK(rows().back()[4].ends_with("; threads 1"));
+    quiet_train(tiny_settings("wodtem"), scratch / "whole");
+    check_same_results(scratch / "whole", run);
+    CHECK_EQUAL(results::Log(scratch / "whole/seconds.csv").table.rows.size(), 1 + progress.rows.size());
+}
+
 TEST(saving_checkpoints_takes_at_most_a_twentieth_of_the_time) {
     CheckpointTimer timer{10};
     CHECK(!timer.due());
