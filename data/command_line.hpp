@@ -421,11 +421,6 @@ inline std::string method_label(const std::string& method) {
     return method == "dt" ? "DT" : method == "odt" ? "ODT" : "WODTEM";
 }
 
-// The task; of own data the file's name, without the ending.
-inline std::string data_name(const Settings& settings) {
-    return settings.task == own_data ? std::filesystem::path(settings.dataset).stem().string() : settings.task;
-}
-
 // --out, or runs/TASK-PRESET-METHOD-SEED; several runs in one --out have folders of their own below it.
 inline std::string folder_of(const Arguments& arguments, const Settings& settings) {
     if (!arguments.has("--out"))

@@ -124,7 +124,7 @@ struct Run {
     Settings settings, usual;  // usual: what task, method and preset make them
     Identity identity;
     size_t method = 0;                   // in `methods`
-    const MujocoTask* mujoco = nullptr;  // null: the grid world
+    const MujocoTask* mujoco = nullptr;  // null: the grid world, or own data
     bool finished = false;
     double so_far = 0;                                    // online interactions
     std::map<std::string, std::vector<double>> progress;  // counts and result_columns of progress.csv
@@ -137,6 +137,7 @@ struct Run {
 
     const Method& about_method() const { return methods[method]; }
     bool offline_only() const { return method == 0; }
+    bool own() const { return settings.task == own_data; }
     // Empty if the run's program did not log it.
     std::vector<double> column(const std::string& name) const {
         const auto found = progress.find(name);
@@ -149,9 +150,10 @@ using Summary = double (*)(const Run&, const Quantity& name);  // final_value or
 
 // The columns of results that are read. Every program wrote the first three. The first six are written as numbers, and
 // so are bounded; the others are only drawn, as far as they can be.
-constexpr std::array result_columns{"eval_length",     "eval_return",  "eval_score",    "advice",
-                                    "advice_distance", "advice_shift", "loss",          "entropy",
-                                    "lambda",          "short",        "gradient_norm", "rollout_return"};
+constexpr std::array result_columns{
+    "eval_length",   "eval_return",    "eval_score",        "advice",        "advice_distance",
+    "advice_shift",  "loss",           "entropy",           "lambda",        "short",
+    "gradient_norm", "rollout_return", "held_out_log_prob", "held_out_error"};
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
 inline std::vector<MoveShares> read_policy(const Log& log) {
@@ -272,7 +274,7 @@ inline Run read_run(const std::string& folder) {
     }
     if (run.mujoco && run.mujoco->maze && exists("paths.csv"))
         run.paths = read_paths(*run.mujoco, Log(file("paths.csv")));
-    if (run.mujoco || !run.finished) return run;
+    if (run.mujoco || run.own() || !run.finished) return run;
     run.policy = read_policy(Log(file("policy.csv")));
     if (!run.offline_only()) run.start_actions = read_start_actions(Log(file("start_actions.csv")));
     return run;
@@ -535,6 +537,10 @@ constexpr Curve curves[] = {
     {"eval_length", "updates", "evaluation length", "steps", "length-updates", "The same over updates."},
     {"rollout_return", "interactions", "return of online episodes", "return", "rollouts",
      "Mean over the episodes since the point before."},
+    {"held_out_log_prob", "updates", "log-probability, held out", "log pi(a | s, g) of a step", "held-out",
+     "Mean over the steps of the trajectories that are held out; for DT minus its loss."},
+    {"held_out_error", "updates", "action error, held out", "error", "held-out-error",
+     "The share of moves that are not the policy's most likely one, or the squared error of its mean."},
     {"loss", "updates", "loss", "L, eq. (9)", "loss",
      "Mean over the updates since the point before, as in the other figures over updates but that of lambda."},
     {"entropy", "updates", "entropy", "H-bar, eq. (10)", "entropy", "Of the policy, on the batches of the updates."},
@@ -550,7 +556,7 @@ inline svg::Chart chart_of(const Group& group, const Curve& curve) {
     const std::string over = curve.x == std::string("updates") ? "updates" : "online interactions";
     svg::Chart chart{group.task + ": " + curve.title + " over " + over, "", over, curve.unit};
     for (const Row& row : group.rows) {
-        const bool level = row.any().offline_only();
+        const bool level = row.any().offline_only() && !row.any().own();
         if (level && !std::string(curve.y).starts_with("eval_")) continue;
         svg::Series& series = chart.series.emplace_back(row.label(), row.colour, std::vector<svg::Line>{}, level);
         for (const Run* run : row.runs) {
@@ -764,7 +770,7 @@ inline Table dose_table(const Group& group) {
 
 // One row for each run: how far it came, its own results, and where it lies.
 inline Table run_table(const Group& group) {
-    const bool grid = !group.any().mujoco;
+    const bool grid = !group.any().mujoco && !group.any().own();
     Table table{{"Run", "State", "Interactions", "Final " + group.unit, "Last 10"}, {}};
     if (grid) table.header.insert(table.header.end(), {"Shortest met", "At 5 from"});
     table.header.push_back("Folder");
@@ -851,6 +857,13 @@ inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
     }
 }
 
+// Own data: the curves of what is held out follow with those of training.
+inline void add_own_data(std::vector<Part>& parts, const Group&) {
+    parts.emplace_back(
+        "There is no environment: nothing is evaluated by acting. On the trajectories that are held out, how likely the "
+        "policy finds their actions, and how far its own are from them.");
+}
+
 // "Updates made, mean over seeds: ODT 42,000; WODTEM 143,000, 3.4 times those of ODT." and what follows from it.
 inline std::string updates_sentence(const Group& group) {
     std::string out;
@@ -872,13 +885,18 @@ inline std::string updates_sentence(const Group& group) {
 // The section of runs of one task, preset and physics, sorted as Group says. Errors: report.same_seed.
 inline Section make_section(const Runs& runs, const std::string& out_folder) {
     const Settings& settings = runs.at(0)->settings;
-    const bool mujoco = runs[0]->mujoco != nullptr;
+    const bool mujoco = runs[0]->mujoco != nullptr, own = runs[0]->own();
+    const std::string name = data_name(settings);
     Group group{runs,
-                settings.task,
+                name,
                 "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
-                settings.task + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
-                mujoco ? "eval_score" : "eval_length",
-                mujoco ? "normalised score" : "length",
+                name + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
+                mujoco ? "eval_score"
+                : own  ? "held_out_log_prob"
+                       : "eval_length",
+                mujoco ? "normalised score"
+                : own  ? "log-probability, held out"
+                       : "length",
                 rows_of(runs)};
     name_differences(group);
     Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
@@ -890,7 +908,7 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
             "Here: the mean length of these shifts, and the length of the mean shift, in which opposite ones cancel.");
         section.parts.emplace_back(doses);
     }
-    (mujoco ? add_mujoco_task : add_grid_world)(section.parts, group);
+    (mujoco ? add_mujoco_task : own ? add_own_data : add_grid_world)(section.parts, group);
     if (const std::string sentence = updates_sentence(group); !sentence.empty()) section.parts.emplace_back(sentence);
     add_curves(section.parts, group, [](auto column) { return !column.starts_with("eval_"); });
     for (const Table& table : {settings_table(group), time_table(group)})
@@ -908,7 +926,8 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs, const std::string& out_folder) {
     std::map<std::tuple<std::string, std::string, std::string>, Runs> groups;
-    for (const Run& run : runs) groups[{run.settings.task, run.settings.preset, run.settings.physics}].push_back(&run);
+    for (const Run& run : runs)
+        groups[{data_name(run.settings), run.settings.preset, run.settings.physics}].push_back(&run);
     const char* const numbers =
         "One section for each task, preset and physics. Runs with equal settings but for the seed are averaged; "
         "others stand apart, and a label in parentheses names the settings that differ from the preset and from other "

@@ -690,6 +690,11 @@ inline std::unique_ptr<Environment> make_environment(const Settings& settings) {
 #endif
 }
 
+// The task; of own data the file's name, without the ending.
+inline std::string data_name(const Settings& settings) {
+    return settings.task == own_data ? std::filesystem::path(settings.dataset).stem().string() : settings.task;
+}
+
 // The score of a return: D4RL's normalised score, and on the grid world the return itself.
 inline double score_of(const Settings& settings, double total_return) {
     const MujocoTask* task = find_mujoco_task(settings.task);

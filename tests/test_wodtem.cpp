@@ -1212,6 +1212,8 @@ TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
     const std::string command = read_file(scratch / "whole/command");
     check_shell(command.substr(0, command.size() - 1) + " --out " + scratch / "again", 0, "trajectories held out");
     CHECK(read_file(scratch / "whole/model.safetensors") == read_file(scratch / "again/model.safetensors"));
+    check_shell("./wodtem report " + scratch / "whole --out " + scratch / "report", 0, "log-probability, held out");
+    CHECK(fs::exists(scratch / "report/own-small-held-out.svg"));
     check_shell("./wodtem eval " + scratch / "whole", 1, "own data have no environment");
     check_shell("./wodtem train data", 2, "wodtem train FILE.hdf5");
     check_shell("./wodtem train " + scratch / "none.hdf5", 1, "none.hdf5");
