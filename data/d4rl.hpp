@@ -123,6 +123,8 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
     const bool is_group = !found && std::ranges::any_of(file.datasets, below);
     require(!is_group, "dataset.shape", file.path, ": \"", name, "\" is a group; write one table of numbers instead");
     require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
+    require(found->unsupported.empty(), "hdf5.unsupported", dataset_place(file.path, name),
+            "cannot be read: ", found->unsupported);
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
     const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
@@ -144,8 +146,8 @@ inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std
         const std::set<std::string> known = {"observations", "actions", "rewards", "terminals", "next_observations"};
         if (name.find('/') != std::string::npos || known.contains(name) || name == ends) continue;
         const Hdf5Dataset* column = file.find(name);
-        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column", file.path, ": \"", name,
-                "\" has a row for each step and is not read beside ", ends,
+        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column",
+                dataset_place(file.path, name), "has a row for each step and is not read beside ", ends,
                 "; name what marks the ends of episodes timeouts, and move the rest to a group such as infos");
     }
 }
@@ -192,8 +194,8 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     std::set<uint64_t> episodes;
     for (const std::string& name : file.names()) {
         const std::optional<uint64_t> episode = minari_episode(name);
-        require(episode.has_value(), "dataset.column", file.path, ": \"", name,
-                "\" lies in none of Minari's groups episode_0, episode_1, ...");
+        require(episode.has_value(), "dataset.column", dataset_place(file.path, name),
+                "lies in none of Minari's groups episode_0, episode_1, ...");
         episodes.insert(*episode);
     }
     const auto stated = file.attributes.find("total_episodes");

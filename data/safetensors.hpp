@@ -278,6 +278,15 @@ inline bool is_utf8(std::string_view text) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tensors
 
+// Returns the number that 16 bits stand for as IEEE 754's binary16: sign, 5 bits of exponent, 10 of fraction.
+inline float half_value(uint16_t bits) {
+    const int exponent = bits >> 10 & 31, fraction = bits & 1023;
+    const int significand = exponent == 0 ? fraction : 1024 + fraction;
+    float magnitude = std::ldexp(static_cast<float>(significand), std::max(exponent, 1) - 25);
+    if (exponent == 31) magnitude = fraction == 0 ? INFINITY : NAN;
+    return bits >> 15 != 0 ? -magnitude : magnitude;
+}
+
 enum class DType : uint8_t { F32, F64, U8, U32, U64, I32, I64, BOOL };
 struct DTypeInfo {
     const char* name;

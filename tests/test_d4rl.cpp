@@ -172,7 +172,7 @@ TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
             CHECK(!"read");
         } catch (const Error& error) {
             CHECK_EQUAL(error.id, "dataset.column");
-            CHECK(std::string(error.what()).find("\"" + std::string(name) + "\" has a row for each") !=
+            CHECK(std::string(error.what()).find("\"" + std::string(name) + "\": has a row for each") !=
                   std::string::npos);
         }
     }
