@@ -58,8 +58,7 @@ inline void print_data_set(const std::string& path, std::string id) {
 
 // Least, greatest and mean of the finite numbers, and the count of the others.
 template <class T>
-std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
-    std::vector<T> values = file.get<T>(tensor.name, tensor.shape);
+std::string value_range(std::vector<T> values) {
     const size_t others = std::erase_if(values, [](T x) { return !std::isfinite(static_cast<double>(x)); });
     if (values.empty()) return "nothing finite";
     Moments finite;
@@ -69,11 +68,14 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
     return text + (others > 0 ? ", NOT FINITE: " + std::to_string(others) : std::string());
 }
 
-// Of a tensor whose type is one of Types; "" for any other.
+// Of a tensor whose type is one of Types, or has 16 bits; "" for any other.
 template <class... Types>
 std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
     std::string range;
-    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range<Types>(file, tensor)) : void()), ...);
+    if (tensor.dtype == DType::F16 || tensor.dtype == DType::BF16) range = value_range(file.numbers(tensor));
+    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range(file.get<Types>(tensor.name, tensor.shape)))
+                                        : void()),
+     ...);
     return range;
 }
 

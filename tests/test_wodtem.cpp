@@ -1733,7 +1733,7 @@ TEST(bad_models_are_refused_with_file_tensor_and_offset) {
     refuses(spoilt("\"data_offsets\":[32,64]", "\"data_offsets\":[64,32]"), "safetensors.offsets",
             "\"embed_return.bias\"");
     refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"I64\",\"shape\":[8]"), "safetensors.dtype", "\"embed_state.weight\"");
-    refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"BF16\",\"shape\":[8,4]"), "safetensors.dtype", "\"BF16\"");
+    refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"F8_E5M2\",\"shape\":[8,8]"), "safetensors.dtype", "\"F8_E5M2\"");
     refuses(spoilt("[8,2]", "[2,8]"), "safetensors.shape", "\"embed_state.weight\" has shape [2, 8], expected [8, 2]");
     refuses(spoilt("[8,2]", "[8,3]"), "safetensors.shape", "\"embed_state.weight\"");
     refuses(spoilt("\"shape\":[24]", "\"shape\":[18446744073709551615,2]"), "safetensors.shape", "c_attn.bias");
@@ -1803,6 +1803,26 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
     check_shell("./wodtem import " + scratch / "full.safetensors" + " " + back + set, 0, "gridworld, wodtem");
     other.load(back);
     CHECK_EQUAL(other.run.agent.normaliser.deviation[1], 4.0f);
+    for (const float bad : {NAN, INFINITY, -INFINITY}) {  // statistics that are no numbers, as tensors and as text
+        TensorFile spoilt = plain;
+        spoilt.add("state_mean", {2}, std::array{1.0f, bad});
+        spoilt.add("state_std", {2}, std::array{3.0f, 4.0f});
+        write_safetensors(scratch / "spoilt.safetensors", spoilt);
+        check_shell("./wodtem import " + scratch / "spoilt.safetensors" + " " + back + set, 1,
+                    "tensor state_mean holds a number that is not finite");
+        spoilt = plain;
+        spoilt.metadata = {{"state_mean", "1 2"}, {"state_std", "3 " + number_text(bad)}};
+        write_safetensors(scratch / "spoilt.safetensors", spoilt);
+        check_shell("./wodtem import " + scratch / "spoilt.safetensors" + " " + back + set, 1,
+                    "metadata entry state_std is not 2 finite numbers");
+    }
+    TensorFile twice;  // the same network in F64
+    for (const StoredTensor& tensor : full.tensors) twice.add(tensor.name, tensor.shape, full.numbers(tensor));
+    write_safetensors(scratch / "twice.safetensors", twice);
+    const std::string before = read_file(back);
+    check_shell("./wodtem import " + scratch / "twice.safetensors" + " " + back + set, 0, "gridworld, wodtem");
+    CHECK(read_file(back) == before);
+    check_shell("./wodtem info " + scratch / "twice.safetensors", 0, "F64 [8, 2]");
     check_shell("./wodtem import " + odt + " " + back + set + " --set layers=2", 1, "\"transformer.h.1.ln_1.weight\"");
     check_shell("./wodtem import " + odt + " " + back + set + " --set width=16", 1,
                 "\"embed_return.weight\" has shape [8, 1]");
