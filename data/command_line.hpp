@@ -35,7 +35,7 @@ inline const Option option_table[] = {
     {"train import trace", "--physics", "NAME", "",
      "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
     {"train import sweep check", "--dataset", "FILE", "",
-     "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
+     "HDF5 in D4RL's or Minari's layout, or Minari's folder (default: by the task's name); random: none"},
     {"train", "--weights", "MODEL", "",
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
@@ -300,7 +300,7 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
             set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
         return;
     }
-    settings.dataset_path = given.empty() ? find_data_set(*published) : given;
+    settings.dataset_path = given.empty() ? find_data_set(*published) : data_set_file(given);
     settings.dataset_sha256 = sha256_of_file(settings.dataset_path);
     settings.dataset = std::filesystem::path(settings.dataset_path).filename();
     const bool original = published && settings.dataset_sha256 == published->sha256;

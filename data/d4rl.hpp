@@ -8,7 +8,8 @@
 // d3rlpy 1 writes the same but for episode_terminals, N, in the place of timeouts: the last step of any episode.
 // A Minari file has a group for each episode, of T steps:
 //   episode_0/observations  T+1 x S | actions  T x A | rewards, terminations, truncations  T          episode_1/...
-// and in the attribute total_episodes says how many there are.
+// and in the attribute total_episodes says how many there are. Where observations are dictionaries, as in its mazes,
+// episode_0/observations is a group of tables, of which minari_states says which ones are the state.
 // Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
@@ -74,6 +75,18 @@ inline std::string file_name(const PublishedDataSet& set) { return std::filesyst
 
 constexpr const char* own_folder = "runs/datasets";
 
+// Returns the file of a data set: `given` itself, or that of the numbers in a folder of Minari's.
+// Errors: dataset.arrow for Minari's other form.
+inline std::string data_set_file(const std::string& given) {
+    if (!std::filesystem::is_directory(given)) return given;
+    for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
+        if (std::filesystem::exists(given + file)) return given + file;
+    for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow"})
+        require(!std::filesystem::exists(given + file), "dataset.arrow", given,
+                ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
+    return given;
+}
+
 // Returns D4RL's cache: the folder that its environment variable names, else one in the home folder.
 inline std::string d4rl_folder() {
     if (const char* folder = std::getenv("D4RL_DATASET_DIR"); folder && *folder) return folder;
@@ -104,6 +117,8 @@ struct Rows {
     std::vector<float> observations, next_observations;  // [count, state_dim]; the second may be empty
     std::vector<float> actions, rewards;                 // [count, action_dim], [count]
     std::vector<uint8_t> terminals, timeouts;            // [count]; timeouts may be empty
+    bool of_minari = false;                              // the file's layout
+    std::string read_as = "";                            // what was chosen in reading it; "": nothing was to choose
 
     const float* observation(size_t row) const { return &observations[row * state_dim]; }
     bool ends(size_t row) const { return terminals[row] != 0 || (!timeouts.empty() && timeouts[row] != 0); }
@@ -121,7 +136,8 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
     const Hdf5Dataset* found = file.find(name);
     const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
     const bool is_group = !found && std::ranges::any_of(file.datasets, below);
-    require(!is_group, "dataset.shape", file.path, ": \"", name, "\" is a group; write one table of numbers instead");
+    require(!is_group, "dataset.shape", file.path, ": \"", name,
+            "\" is a group; write one table of numbers instead, or name a maze's task");
     require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
     require(found->unsupported.empty(), "hdf5.unsupported", dataset_place(file.path, name),
             "cannot be read: ", found->unsupported);
@@ -205,26 +221,90 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     return episodes;
 }
 
+// Of the dictionary observations of Minari's mazes (Gymnasium-Robotics): the parts that are a task's state, side by side.
+struct MinariState {
+    Rules rules;
+    std::vector<std::string> parts;  // below "observations"
+    const char* meaning;             // what was chosen, and how the two worlds differ
+};
+inline const MinariState minari_states[] = {
+    {Rules::antmaze,
+     {"/achieved_goal", "/observation"},
+     "the state is achieved_goal and observation; AntMaze counts positions from the middle of the map and y upwards, antmaze from its start cell and y downwards; "
+     "its goal has a radius of 0.45, not 0.5"},
+    {Rules::maze2d,
+     {"/observation"},
+     "the state is observation; PointMaze's positions, velocities and actions are turned and moved into maze2d's coordinates; what remains: a "
+     "touch of a wall ends 0.03 to 0.07 elsewhere, its goal has a radius of 0.45, not 0.5, and each episode has its "
+     "own, to which the rewards belong"}};
+
+// Returns the parts of the dictionary observations in the group `name` that are the task's state; null where it is no
+// group, or the task has none.
+inline const MinariState* minari_state(const Hdf5File& file, const std::string& name, const MujocoTask* task) {
+    const auto of_task = [&](const MinariState& state) { return task && state.rules == task->rules; };
+    const auto found = std::ranges::find_if(minari_states, of_task);
+    return found != std::end(minari_states) && file.groups.contains(name) ? found : nullptr;
+}
+
+// Returns tables of so many rows side by side, row-major; each name is `group` and a part. Errors: those of table_of().
+inline std::vector<double> read_side_by_side(const Hdf5File& file, const std::string& group,
+                                             const std::vector<std::string>& parts, uint64_t rows) {
+    std::vector<std::vector<double>> tables;
+    for (const std::string& part : parts) tables.push_back(file.read<double>(table_of(file, group + part, rows).data));
+    std::vector<double> all;
+    for (uint64_t row = 0; row < rows; ++row)
+        for (const std::vector<double>& table : tables) {
+            const size_t width = table.size() / rows;
+            all.insert(all.end(), table.begin() + row * width, table.begin() + (row + 1) * width);
+        }
+    return all;
+}
+
+// Turns numbers of Minari's PointMaze-v3 into those of maze2d, whose map is the same: PointMaze's X and Y run along
+// columns and up the rows from the middle of the map, maze2d's x and y down rows and along columns (maze_place()).
+//   states, rows (X, Y, VX, VY):   (rows / 2 - 0.7 - Y, columns / 2 - 0.7 + X, -VY, VX)     actions (A, B):   (-B, A)
+inline void turn_to_maze2d(std::vector<double>& states, std::vector<float>& actions, const MujocoTask& task) {
+    const std::string_view map = task.maze;
+    const double top = static_cast<double>(std::ranges::count(map, '/')) / 2 - 0.7;
+    const double left = static_cast<double>(map.find('/')) / 2 - 0.7;
+    for (size_t i = 0; i + 4 <= states.size(); i += 4) {
+        const std::array<double, 4> s = {states[i], states[i + 1], states[i + 2], states[i + 3]};
+        std::ranges::copy(std::array{top - s[1], left + s[0], -s[3], s[2]}, &states[i]);
+    }
+    for (size_t i = 0; i + 2 <= actions.size(); i += 2) {
+        std::swap(actions[i], actions[i + 1]);
+        actions[i] = -actions[i];
+    }
+}
+
 // Reads Minari's episodes, one after the other. The observation after the last action becomes the last row's next one.
-// Errors: dataset.shape, those of minari_episodes() and hdf5.hpp.
-inline Rows read_minari(const Hdf5File& file) {
+// task: whose state dictionary observations are to give; null: they are refused. Errors: dataset.shape, those of
+// minari_episodes() and hdf5.hpp.
+inline Rows read_minari(const Hdf5File& file, const MujocoTask* task = nullptr) {
     Rows rows;
+    rows.of_minari = true;
     for (const uint64_t episode : minari_episodes(file)) {
         const std::string group = "episode_" + std::to_string(episode) + "/";
         const Hdf5Table actions = table_of(file, group + "actions");
         const uint64_t steps = actions.rows;
-        const Hdf5Table states = table_of(file, group + "observations", steps + 1);
-        if (rows.count == 0) rows.state_dim = states.columns;
+        const MinariState* dictionary = minari_state(file, group + "observations", task);
+        const std::vector<std::string> parts = dictionary ? dictionary->parts : std::vector<std::string>{""};
+        std::vector<double> states = read_side_by_side(file, group + "observations", parts, steps + 1);
+        const size_t columns = states.size() / (steps + 1);
+        if (rows.count == 0) rows.state_dim = columns;
         if (rows.count == 0) rows.action_dim = actions.columns;
-        const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
-        const bool alike = states.columns == rows.state_dim && actions.columns == rows.action_dim;
-        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
-                states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
-                " and ", rows.action_dim, " columns");
-        const std::vector<float> all = file.read<float>(states.data);
+        const bool empty = steps == 0 || columns == 0 || actions.columns == 0;
+        const bool alike = columns == rows.state_dim && actions.columns == rows.action_dim;
+        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ", columns,
+                " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim, " and ",
+                rows.action_dim, " columns");
+        std::vector<float> taken = file.read<float>(actions.data);
+        if (dictionary && task->rules == Rules::maze2d) turn_to_maze2d(states, taken, *task);
+        if (dictionary) rows.read_as = dictionary->meaning;
+        const std::vector<float> all(states.begin(), states.end());  // rounded to the nearest
         append_all(rows.observations, std::span(all).first(steps * rows.state_dim));
         append_all(rows.next_observations, std::span(all).last(steps * rows.state_dim));
-        append_all(rows.actions, file.read<float>(actions.data));
+        append_all(rows.actions, taken);
         append_all(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
         append_all(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
         append_all(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
@@ -234,9 +314,9 @@ inline Rows read_minari(const Hdf5File& file) {
     return rows;
 }
 
-inline Rows read_data_set(const std::string& path) {
-    const Hdf5File file = open_hdf5(path);
-    return is_minari(file) ? read_minari(file) : read_rows(file);
+// task: as for read_minari().
+inline Rows read_data_set(const Hdf5File& file, const MujocoTask* task = nullptr) {
+    return is_minari(file) ? read_minari(file, task) : read_rows(file);
 }
 
 // True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock.
@@ -356,14 +436,62 @@ inline void require_sound(const Rows& rows, const std::string& path) {
     require_all("rewards", rows.rewards, 1, any);
 }
 
-// The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.
+// Returns the rows whose position lies in no free cell of maze2d's map; of other tasks none.
+inline std::vector<size_t> rows_outside(const Rows& rows, const MujocoTask& task) {
+    std::vector<size_t> outside;
+    if (task.rules != Rules::maze2d) return outside;
+    const std::string_view map = task.maze;
+    const size_t width = map.find('/') + 1;
+    for (size_t row = 0; row < rows.count; ++row) {
+        const float* const state = rows.observation(row);
+        const MazePlace place = maze_place(task, state[0], state[1]);
+        const bool near = std::fabs(place.row) < 100 && std::fabs(place.column) < 100;  // never so for NaN
+        const long i = near ? std::lround(place.row) : -1, j = near ? std::lround(place.column) : -1;
+        const size_t cell = static_cast<size_t>(i) * width + static_cast<size_t>(j);
+        const bool on_map = i >= 0 && j >= 0 && static_cast<size_t>(j) + 1 < width && cell < map.size();
+        if (!on_map || map[cell] == '1') outside.push_back(row);
+    }
+    return outside;
+}
+
+// Returns what a user should know of a data set before training on it under these physics, a sentence each.
+inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& task, const std::string& physics) {
+    std::vector<std::string> remarks;
+    if (!rows.read_as.empty()) remarks.push_back(rows.read_as);
+    if (rows.of_minari && !task.maze && physics == "d4rl")
+        remarks.push_back(
+            "Minari's layout: if Gymnasium's bodies made these data, they are those of --physics 2.2; those "
+            "of --physics d4rl, which are chosen, weigh up to 8% less and differ from the first step on");
+    const size_t with_contacts = 111, before_contacts = 27;  // ant's numbers
+    bool alive = false;
+    if (task.rules == Rules::ant && rows.state_dim == with_contacts)
+        for (size_t i = 0; i < rows.observations.size(); ++i)
+            alive = alive || (i % with_contacts >= before_contacts && rows.observations[i] != 0);
+    if (alive)
+        remarks.push_back(
+            "ant's contact forces (columns 27 to 110) are not 0, as they are in D4RL's data and in this "
+            "program: a policy would learn from numbers that it will never see");
+    if (const std::vector<size_t> outside = rows_outside(rows, task); !outside.empty())
+        remarks.push_back(text_of(outside.size(), " of ", rows.count, " positions lie in no free cell of ", task.name,
+                                  ", first in row ", outside[0],
+                                  ": is it of another maze, or PointMaze's in coordinates of "
+                                  "its own? Minari's own file of it is read in the right ones"));
+    return remarks;
+}
+
+// The file's trajectories for a task, without returns; what remarks_on() says goes to stderr. Errors: dataset.*, hdf5.*,
+// file.*; dataset.place if more than one position in a hundred is outside the maze.
 // use_timeouts: cut where the file says so; else at the time limit, as in a file without timeouts (and at terminals).
-inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task,
-                                             bool use_timeouts = true) {
-    Rows rows = read_data_set(path);
+inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task, bool use_timeouts = true,
+                                             const std::string& physics = "none") {
+    Rows rows = read_data_set(open_hdf5(path), &task);
     if (!use_timeouts) rows.timeouts.clear();
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
+    const std::vector<std::string> remarks = remarks_on(rows, task, physics);
+    if (rows_outside(rows, task).size() * 100 > rows.count)
+        throw Error("dataset.place", path + ": " + remarks.back());  // which is about them
+    for (const std::string& remark : remarks) std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
     return trajectories;
 }
 
@@ -407,7 +535,8 @@ inline std::vector<Trajectory> make_data_set(const Settings& settings) {
                                         static_cast<Behaviour>(index_of(behaviour_names, settings.behaviour)), seed,
                                         static_cast<int>(settings.data_trajectories));
     else if (settings.behaviour == "recorded")
-        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings.cut == "flags");
+        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings.cut == "flags",
+                                     settings.physics);
     else
         for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
             if (auto trajectory = random_trajectory(*environment, seed, number))

@@ -39,8 +39,8 @@ inline void print_data_set(const std::string& path, std::string id) {
     }
     print_datasets(file);
     if (!is_minari(file) && !file.find("observations")) return;
-    const Rows rows = is_minari(file) ? read_minari(file) : read_rows(file);
     const MujocoTask* task = find_mujoco_task(id);
+    const Rows rows = read_data_set(file, task);
     if (!task)
         std::printf("The name tells no task, so there is no score, and flags alone end trajectories (see --task)\n");
     const std::vector<Trajectory> trajectories = task ? cut_trajectories(rows, *task, path) : cut_at_flags(rows, 1000);
@@ -50,6 +50,8 @@ inline void print_data_set(const std::string& path, std::string id) {
     if (task)
         std::printf("mean normalised score of a trajectory: %.2f (%s)\n",
                     normalised_score(*task, statistics.returns.mean()), task->name);
+    if (task)
+        for (const std::string& remark : remarks_on(rows, *task, "d4rl")) std::printf("note: %s\n", remark.c_str());
     print_published(find_published(id));
 }
 
@@ -96,7 +98,8 @@ inline void print_tensors(const std::string& path) {
 }
 
 // The command `info`. task: a task's id, or "".
-inline void print_info(const std::string& path, const std::string& task) {
+inline void print_info(const std::string& given, const std::string& task) {
+    const std::string path = data_set_file(given);
     if (is_hdf5(path))
         print_data_set(path, task.empty() ? "" : full_task_name(task));
     else

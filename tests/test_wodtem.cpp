@@ -1053,7 +1053,7 @@ TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
     check_shell(eval + " --seed 5 --episodes 3 --set g_eval=0.5 --set eval_context=1", 0, "seed 5: mean length");
     check_shell(eval + " --episodes 3", 0, "over 3 episodes");
     check_shell(eval + " --episodes 3 --record " + scratch / "made.hdf5", 0, "over 3 episodes");
-    const Rows rows = read_data_set(scratch / "made.hdf5");
+    const Rows rows = read_data_set(open_hdf5(scratch / "made.hdf5"));
     CHECK_EQUAL(number_text(rows.count), number_text(3 * static_cast<int>(*to_number(last_row()[12]))));  // three alike
     CHECK(rows.state_dim == 2 && rows.action_dim == 1 && rows.ends(rows.count - 1) && rows.ends(rows.count / 3 - 1));
     CHECK_EQUAL(std::count(rows.terminals.begin(), rows.terminals.end(), 1) +

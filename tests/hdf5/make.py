@@ -288,6 +288,24 @@ def shared():  # h5repack -s 1 (HDF5 1.10.8): a header's messages lie in a heap 
         pack("shared", open(new, "rb").read())
 
 
+def minari_mazes():  # Minari 0.5.4, Gymnasium-Robotics 1.4.2, MuJoCo 3.4.0: two short episodes each, of random actions
+    import gymnasium, gymnasium_robotics, minari as library_of_minari
+    gymnasium.register_envs(gymnasium_robotics)
+
+    class Whole(gymnasium.RewardWrapper):
+        def reward(self, reward):
+            return int(reward)  # stored as int64
+    for name, id, steps in [("pointmaze", "PointMaze_Medium-v3", 12), ("antmaze", "AntMaze_UMaze-v4", 3)]:
+        env = library_of_minari.DataCollector(Whole(gymnasium.make(id, max_episode_steps=steps)), record_infos=False)
+        rng = np.random.default_rng(0)
+        for episode in range(2):
+            env.reset(seed=episode)
+            for _ in range(steps):
+                env.step(rng.uniform(-1, 1, env.action_space.shape).astype("f4"))
+        made = env.create_dataset(dataset_id=name + "/x-v0", algorithm_name="a", author="b", author_email="c", code_permalink="d")
+        pack(name, (pathlib.Path(made.storage.data_path) / "main_data.hdf5").read_bytes())
+
+
 def skewed():  # no HDF5: 4180 bytes, byte k Fibonacci(k + 1) times, so that codes have up to 15 bits
     a, b, text = 1, 1, b""
     for k in range(17):
@@ -328,6 +346,7 @@ if suffix == "":
     make("peers_latest", peers, libver="latest")
     tables()
     shared()
+    minari_mazes()
     skewed()
 else:
     make("latest", everything, libver="latest")
