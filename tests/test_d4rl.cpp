@@ -2,7 +2,7 @@
 // its name among the settings.
 #include <unistd.h>
 
-#include "../data/d4rl.hpp"
+#include "../data/info.hpp"
 #include "test.hpp"
 
 namespace {
@@ -203,6 +203,39 @@ TEST(pointmaze_of_minari_is_maze2d_turned_and_moved) {
     CHECK_FAILS("dataset.shape", read_minari(file));
     CHECK_FAILS("dataset.shape", read_minari(file, find_mujoco_task("hopper")));
 }
+
+#ifdef WODTEM_MUJOCO
+// Gymnasium's Hopper-v5 on MuJoCo 3.4.0 is, but for the reward, that of physics 2.2; our own data are of their physics.
+TEST(recorded_transitions_tell_the_bodies_that_made_them) {
+    const MujocoTask& hopper = *find_mujoco_task("hopper");
+    const Rows rows = read_minari(file_of_minari("hopper"));
+    const auto largest = [&](const Rows& data, Physics physics) {
+        const std::vector<double> differences = transition_differences(data, hopper, physics);
+        CHECK(differences.size() > 20 && std::ranges::is_sorted(differences));
+        return differences.back();
+    };
+    CHECK(largest(rows, Physics::mujoco_2_2) < 1e-5);  // the observations of the file, in float
+    CHECK(largest(rows, Physics::d4rl) > 1e-3);
+    Rows own;
+    MujocoEnvironment environment(hopper, Physics::d4rl);
+    own.state_dim = 11;
+    own.action_dim = 3;
+    for (uint64_t episode = 0; own.count < 450; ++episode) {
+        const auto trajectory = random_trajectory(environment, 1, episode);
+        append_all(own.observations, trajectory->states);
+        append_all(own.actions, trajectory->actions);
+        own.count += trajectory->rewards.size();
+        own.terminals.resize(own.count);
+        own.terminals.back() = 1;
+    }
+    CHECK(largest(own, Physics::d4rl) < 1e-4);
+    CHECK(largest(own, Physics::mujoco_2_2) > 1e-3);
+    own.observations[5] = 10;  // row 0: a velocity at its limit
+    CHECK(transition_differences(own, hopper, Physics::d4rl).size() < 200);
+    own.actions.assign(own.actions.size(), NAN);
+    CHECK(transition_differences(own, hopper, Physics::d4rl).empty());
+}
+#endif
 
 TEST(antmaze_of_minari_has_its_position_in_front) {
     const MujocoTask& task = *find_mujoco_task("antmaze-umaze-v2");

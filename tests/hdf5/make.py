@@ -288,15 +288,16 @@ def shared():  # h5repack -s 1 (HDF5 1.10.8): a header's messages lie in a heap 
         pack("shared", open(new, "rb").read())
 
 
-def minari_mazes():  # Minari 0.5.4, Gymnasium-Robotics 1.4.2, MuJoCo 3.4.0: two short episodes each, of random actions
+def minaris():  # Minari 0.5.4, Gymnasium-Robotics 1.4.2, MuJoCo 3.4.0: two short episodes each, of random actions
     import gymnasium, gymnasium_robotics, minari as library_of_minari
     gymnasium.register_envs(gymnasium_robotics)
 
     class Whole(gymnasium.RewardWrapper):
         def reward(self, reward):
             return int(reward)  # stored as int64
-    for name, id, steps in [("pointmaze", "PointMaze_Medium-v3", 12), ("antmaze", "AntMaze_UMaze-v4", 3)]:
-        env = library_of_minari.DataCollector(Whole(gymnasium.make(id, max_episode_steps=steps)), record_infos=False)
+    for name, id, steps in [("pointmaze", "PointMaze_Medium-v3", 12), ("antmaze", "AntMaze_UMaze-v4", 3), ("hopper", "Hopper-v5", 15)]:
+        env = gymnasium.make(id, max_episode_steps=steps)
+        env = library_of_minari.DataCollector(env if name == "hopper" else Whole(env), record_infos=False)
         rng = np.random.default_rng(0)
         for episode in range(2):
             env.reset(seed=episode)
@@ -346,7 +347,7 @@ if suffix == "":
     make("peers_latest", peers, libver="latest")
     tables()
     shared()
-    minari_mazes()
+    minaris()
     skewed()
 else:
     make("latest", everything, libver="latest")
