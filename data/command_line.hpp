@@ -36,6 +36,7 @@ inline const Option option_table[] = {
      "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
     {"train import sweep check", "--dataset", "FILE", "",
      "HDF5 in D4RL's or Minari's layout, or Minari's folder (default: by the task's name); random: none"},
+    {"train import", "--clip-actions", nullptr, "", "clip the data set's actions to [-1, 1], not refuse those beyond"},
     {"train", "--weights", "MODEL", "",
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
@@ -337,6 +338,7 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
         fail("usage.option", "the grid world makes its own data set; leave --dataset out");
     }
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
+    if (arguments.has("--clip-actions")) set_from(settings, "clip_actions", "yes", "command line");
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
     settings.arithmetic = kernel_of(arguments).arithmetic;

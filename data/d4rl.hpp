@@ -221,7 +221,7 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     return episodes;
 }
 
-// Of the dictionary observations of Minari's mazes (Gymnasium-Robotics): the parts that are a task's state, side by side.
+// Of the dictionary observations of Minari's mazes (of Gymnasium-Robotics): the parts that make up a task's state.
 struct MinariState {
     Rules rules;
     std::vector<std::string> parts;  // below "observations"
@@ -230,12 +230,13 @@ struct MinariState {
 inline const MinariState minari_states[] = {
     {Rules::antmaze,
      {"/achieved_goal", "/observation"},
-     "the state is achieved_goal and observation; AntMaze counts positions from the middle of the map and y upwards, antmaze from its start cell and y downwards; "
-     "its goal has a radius of 0.45, not 0.5"},
+     "the state is achieved_goal and observation; AntMaze counts positions from the middle of the map and y upwards, "
+     "antmaze from its start cell and y downwards; its ant pushes with up to 150 N m for 0.05 s, antmaze's with 30 N m "
+     "for 0.1 s; its goal has a radius of 0.45, not 0.5"},
     {Rules::maze2d,
      {"/observation"},
-     "the state is observation; PointMaze's positions, velocities and actions are turned and moved into maze2d's coordinates; what remains: a "
-     "touch of a wall ends 0.03 to 0.07 elsewhere, its goal has a radius of 0.45, not 0.5, and each episode has its "
+     "the state is observation; PointMaze's positions, velocities and actions are turned and moved into maze2d's "
+     "coordinates; what remains: a touch of a wall ends 0.03 to 0.07 elsewhere, its goal has a radius of 0.45, not 0.5, and each episode has its "
      "own, to which the rewards belong"}};
 
 // Returns the parts of the dictionary observations in the group `name` that are the task's state; null where it is no
@@ -425,7 +426,8 @@ inline void require_sound(const Rows& rows, const std::string& path) {
             const bool finite = std::isfinite(values[i]);
             const std::string found = text_of("\", row ", i / width, ", column ", i % width, " is ", values[i]);
             require(!finite, "dataset.action", path, ": \"", name, found,
-                    "; actions lie in [-1, 1]: is it of another task, or not scaled?");
+                    "; actions lie in [-1, 1]: is it of another task, or not scaled? Where they are commands that a "
+                    "machine cut off, --clip-actions does the same");
             require(finite, "dataset.not_finite", path, ": \"", name, found,
                     "; only finite numbers can be learned from");
         }
@@ -460,8 +462,8 @@ inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& t
     if (!rows.read_as.empty()) remarks.push_back(rows.read_as);
     if (rows.of_minari && !task.maze && physics == "d4rl")
         remarks.push_back(
-            "Minari's layout: if Gymnasium's bodies made these data, they are those of --physics 2.2; those "
-            "of --physics d4rl, which are chosen, weigh up to 8% less and differ from the first step on");
+            "it is of Minari's layout: if Gymnasium made the data, its bodies are those of --physics 2.2; those of "
+            "physics d4rl, which train takes unless told otherwise, weigh up to 7.7% less and move otherwise");
     const size_t with_contacts = 111, before_contacts = 27;  // ant's numbers
     bool alive = false;
     if (task.rules == Rules::ant && rows.state_dim == with_contacts)
@@ -479,16 +481,30 @@ inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& t
     return remarks;
 }
 
-// The file's trajectories for a task, without returns; what remarks_on() says goes to stderr. Errors: dataset.*, hdf5.*,
-// file.*; dataset.place if more than one position in a hundred is outside the maze.
-// use_timeouts: cut where the file says so; else at the time limit, as in a file without timeouts (and at terminals).
-inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task, bool use_timeouts = true,
-                                             const std::string& physics = "none") {
+// Clips the finite actions to [-1, 1] and says how many it changed.
+inline void clip_actions(Rows& rows, const std::string& path) {
+    size_t changed = 0;
+    for (float& action : rows.actions) {
+        if (std::fabs(action) <= 1 || !std::isfinite(action)) continue;
+        action = std::copysign(1.0f, action);
+        ++changed;
+    }
+    std::fprintf(stderr, "%s: %zu of %zu numbers of actions lay beyond 1 and were clipped\n", path.c_str(), changed,
+                 rows.actions.size());
+}
+
+// The file's trajectories for a task, without returns; what remarks_on() says goes to stderr. Of the settings it heeds
+// cut (flags: where the file says so; else at the time limit, as in a file without timeouts, and at terminals),
+// clip_actions and physics. Errors: dataset.*, hdf5.*, file.*; dataset.place if more than one position in a hundred is
+// outside the maze.
+inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task,
+                                             const Settings& settings = {}) {
     Rows rows = read_data_set(open_hdf5(path), &task);
-    if (!use_timeouts) rows.timeouts.clear();
+    if (settings.cut != "flags") rows.timeouts.clear();
+    if (settings.clip_actions) clip_actions(rows, path);
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
-    const std::vector<std::string> remarks = remarks_on(rows, task, physics);
+    const std::vector<std::string> remarks = remarks_on(rows, task, settings.physics);
     if (rows_outside(rows, task).size() * 100 > rows.count)
         throw Error("dataset.place", path + ": " + remarks.back());  // which is about them
     for (const std::string& remark : remarks) std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
@@ -535,8 +551,7 @@ inline std::vector<Trajectory> make_data_set(const Settings& settings) {
                                         static_cast<Behaviour>(index_of(behaviour_names, settings.behaviour)), seed,
                                         static_cast<int>(settings.data_trajectories));
     else if (settings.behaviour == "recorded")
-        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings.cut == "flags",
-                                     settings.physics);
+        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings);
     else
         for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
             if (auto trajectory = random_trajectory(*environment, seed, number))

@@ -736,9 +736,9 @@ struct Hdf5Parser {
     };
     using Links = std::vector<Link>;
 
-    // Reads the data set or group of this path; what a group holds is visited later, so that of several paths to a group
-    // the shortest becomes its own, and the others are links to it. A named type is passed over, as is what lies so deep
-    // that its path has more than 4096 bytes.
+    // Reads the data set or group of this path. What a group holds is visited later, so that of several paths to a
+    // group the shortest becomes its own, and the others are links to it. A named type is passed over, as is what lies
+    // so deep that its path has more than 4096 bytes.
     void visit(const std::string& path, uint64_t address) {
         object = path.empty() ? "root group" : json_string(path);
         const std::vector<Message> header = messages(address);

@@ -26,10 +26,10 @@ inline void print_published(const PublishedDataSet* set) {
                     set->mean_return, set->deviation, set->low, set->high);
 }
 
-// Makes up to 200 recorded transitions, spread over the rows, once more under these physics. Returns of each the largest
-// difference between the observation that follows and the recorded one, ascending. Left out: contact forces, rows whose
-// next one is not known, whose velocities are clipped, or that the engine breaks down on. What is not observed, x and for
-// ant y, is taken for 0, which changes nothing.
+// Takes up to 200 recorded steps, spread over the rows, again under these physics. Returns of each the largest
+// difference between the observation that follows and the recorded one, ascending; {} without MuJoCo. Left out: contact
+// forces, and rows whose next one is not known, whose velocities are clipped, or that the engine breaks down on. What
+// is not observed, x and for ant y, is taken for 0, which changes nothing.
 inline std::vector<double> transition_differences([[maybe_unused]] const Rows& rows,
                                                   [[maybe_unused]] const MujocoTask& task,
                                                   [[maybe_unused]] Physics physics) {

@@ -154,7 +154,7 @@ struct Settings {
 
     int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
     double g_online = 2, g_eval = 1, reward_scale = 1;
-    bool keep_lowest = false;
+    bool keep_lowest = false, clip_actions = false;
     std::string sampling = "uniform", cut = "flags";
 
     double gamma = 0.99, alpha = 0.75, epsilon = 0.1, tau = 1;
@@ -235,6 +235,7 @@ inline const SettingRow setting_rows[] = {
      "chosen: so ODT ends near the paper's 7; DT's and ODT's code: by_length"},
     {"cut", &Settings::cut, 0, 0, "flags|episodes",
      "D4RL's and ODT's code; episodes (maze2d): at the time limit alone"},
+    {"clip_actions", &Settings::clip_actions, 0, 0, "", "chosen: recorded actions beyond 1 are refused"},
     // Episodic memory.
     {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
     {"alpha", &Settings::alpha, 0, 1, "", "WODTEM sec. V-D: eq. (7)"},
@@ -437,6 +438,8 @@ inline void check_together(const Settings& settings) {
     if (online_steps > 0 && settings.method == "dt")
         fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
     const bool gridworld = settings.task == "gridworld";
+    if (gridworld && settings.clip_actions)
+        fail("usage.setting", "the grid world's actions are moves, which cannot be clipped: clip_actions must be no");
     if (gridworld != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
              gridworld ? "a table of moves: none" : "d4rl or 2.2");
@@ -482,9 +485,13 @@ inline std::string source_of(const Settings& settings, const SettingRow& row) {
     return source == settings.source.end() ? row.source : source->second;
 }
 
+// A setting that came later: files do not have it where it is at its initial value, and so are as they were before.
+inline bool is_later(const SettingRow& row) { return row.name == std::string_view("clip_actions"); }
+
 inline std::string settings_text(const Settings& settings) {
     std::string text;
     for (const SettingRow& row : setting_rows) {
+        if (is_later(row) && setting_text(settings, row) == setting_text({}, row)) continue;
         std::string line = std::string(row.name) + " = " + quoted(setting_text(settings, row));
         line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
         text += line + "# " + source_of(settings, row) + "\n";
@@ -534,7 +541,7 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
         }
     }
     for (const SettingRow& row : setting_rows)
-        if (!settings.source.contains(row.name))
+        if (!settings.source.contains(row.name) && !is_later(row))
             fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
                  row.name);
     return settings;

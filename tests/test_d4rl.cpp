@@ -167,8 +167,8 @@ bool some_contain(const std::vector<std::string>& sentences, const std::string& 
 
 }  // namespace
 
-// The map has 8 rows and 8 columns, whose middle is at 4, so x = 4 - 0.7 - Y and y = 4 - 0.7 + X: by hand for one row, by the engine for
-// each: where no wall is near, our ball moves as Minari's did.
+// The map has 8 rows and 8 columns, whose middle is at 4, so x = 4 - 0.7 - Y and y = 4 - 0.7 + X: by hand for one row,
+// by the engine for each: where no wall is near, our ball moves as Minari's did.
 TEST(pointmaze_of_minari_is_maze2d_turned_and_moved) {
     const MujocoTask& task = *find_mujoco_task("maze2d-medium-v1");
     const Hdf5File file = file_of_minari("pointmaze");
@@ -382,15 +382,17 @@ TEST(cut_by_episodes_maze_data_end_at_the_time_limit_alone) {
     out.add("terminals", {700}, terminals);
     out.add("timeouts", {700}, timeouts);
     out.close();
-    const auto lengths = [&](bool use_timeouts) {
+    const auto lengths = [&](const char* rule) {
+        Settings settings;
+        settings.cut = rule;
         std::vector<int> all;
         for (const Trajectory& trajectory :
-             load_data_set(made_file.path, *find_mujoco_task("maze2d-umaze-v1"), use_timeouts))
+             load_data_set(made_file.path, *find_mujoco_task("maze2d-umaze-v1"), settings))
             all.push_back(trajectory.length());
         return all;
     };
-    CHECK(lengths(true) == (std::vector<int>{100, 350}));
-    CHECK(lengths(false) == (std::vector<int>{300, 300}));
+    CHECK(lengths("flags") == (std::vector<int>{100, 350}));
+    CHECK(lengths("episodes") == (std::vector<int>{300, 300}));
 }
 
 // Rows 2 and 6 (timeouts) and 7 (the last) are no tuples; 1 does not lead to 3, 4 ends by itself, 5 is the last tuple.
@@ -461,7 +463,13 @@ TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
     rows.actions[0] = -1.001f;
     CHECK_EQUAL(said(rows),
                 "dataset.action f: \"actions\", row 0, column 0 is -1.001; actions lie in [-1, 1]: is it of another "
-                "task, or not scaled?");
+                "task, or not scaled? Where they are commands that a machine cut off, --clip-actions does the same");
+    clip_actions(rows, "f");
+    CHECK_EQUAL(said(rows), "");
+    CHECK_EQUAL(rows.actions[0], -1.0f);
+    rows.actions[0] = INFINITY;  // is no command
+    clip_actions(rows, "f");
+    CHECK(said(rows).starts_with("dataset.not_finite"));
     rows.actions[0] = NAN;
     CHECK_EQUAL(said(rows),
                 "dataset.not_finite f: \"actions\", row 0, column 0 is nan; only finite numbers can be learned from");
@@ -474,6 +482,21 @@ TEST(rows_of_another_size_or_without_an_end_are_refused) {
     tiny.state_dim = tiny.action_dim = 1;
     CHECK_FAILS("dataset.empty", cut_trajectories(made({1, 2}, {0, 0}, {}), tiny, "f"));
     CHECK_EQUAL(cut_trajectories(made({1, 2}, {0, 1}, {}), tiny, "f").size(), size_t{1});
+}
+
+// The setting came later: a file of before does not have it, and one of after only where it is yes.
+TEST(clipping_of_actions_is_a_setting_that_only_its_users_files_have) {
+    Settings settings = default_settings("hopper-medium-v2", "wodtem", "small");
+    const std::string text = settings_text(settings);
+    CHECK(text.find("clip_actions") == std::string::npos && !settings_from_text(text, "f").clip_actions);
+    set_from(settings, "clip_actions", "yes", "command line");
+    CHECK(settings_text(settings).find("clip_actions = yes ") != std::string::npos);
+    CHECK(settings_from_text(settings_text(settings), "f").clip_actions);
+    CHECK(train_command(settings).ends_with(" --set clip_actions=yes"));
+    CHECK_FAILS("run.other_settings", require_same_settings(settings_from_text(text, "f"), settings, "g"));
+    Settings grid = default_settings("gridworld", "wodtem", "small");
+    grid.clip_actions = true;
+    CHECK_FAILS("usage.setting", check_together(grid));
 }
 
 TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {
