@@ -26,44 +26,6 @@ inline void print_published(const PublishedDataSet* set) {
                     set->mean_return, set->deviation, set->low, set->high);
 }
 
-// Takes up to 200 recorded steps, spread over the rows, again under these physics. Returns of each the largest
-// difference between the observation that follows and the recorded one, ascending; {} without MuJoCo. Left out: contact
-// forces, and rows whose next one is not known, whose velocities are clipped, or that the engine breaks down on. What
-// is not observed, x and for ant y, is taken for 0, which changes nothing.
-inline std::vector<double> transition_differences([[maybe_unused]] const Rows& rows,
-                                                  [[maybe_unused]] const MujocoTask& task,
-                                                  [[maybe_unused]] Physics physics) {
-    std::vector<double> differences;
-#ifdef WODTEM_MUJOCO
-    MujocoEnvironment environment(task, physics);
-    const auto hidden = task.first_position, positions = environment.model->nq - hidden;  // numbers of qpos
-    const auto observed = positions + environment.model->nv;
-    const size_t count = std::min<size_t>(rows.count, 200);
-    for (size_t k = 0; k < count; ++k) {
-        const size_t row = k * rows.count / count;
-        const float *state = rows.observation(row), *next = nullptr;
-        if (!rows.next_observations.empty()) next = &rows.next_observations[row * rows.state_dim];
-        if (!next && row + 1 < rows.count && !rows.ends(row)) next = rows.observation(row + 1);
-        const auto clipped = [&](float v) { return std::fabs(v) >= task.velocity_limit; };
-        if (!next || std::any_of(state + positions, state + observed, clipped)) continue;
-        std::vector<double> qpos(environment.model->nq);
-        std::copy(state, state + positions, qpos.begin() + hidden);
-        environment.start(qpos, std::vector<double>(state + positions, state + observed));
-        const float* const action = &rows.actions[row * rows.action_dim];
-        try {
-            environment.advance(std::vector<double>(action, action + rows.action_dim));
-        } catch (const Error&) {
-            continue;
-        }
-        double largest = 0;
-        for (int i = 0; i < observed; ++i) largest = std::max(largest, std::fabs(environment.observation[i] - next[i]));
-        differences.push_back(largest);
-    }
-    std::ranges::sort(differences);
-#endif
-    return differences;
-}
-
 // Prints what the file holds, then what it means for a task. `id` names the task; "": it follows from the file's name
 // or checksum. Errors: those of reading the file.
 inline void print_data_set(const std::string& path, std::string id) {

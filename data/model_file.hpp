@@ -71,8 +71,8 @@ inline void load_parameters(ModelContents& model, const TensorFile& file, std::s
     require(differences.empty(), "model.names", file.path, ": does not hold the network of its settings: ", differences,
             "; are layers, position and method right?");
     for (Parameter<float>& parameter : model.parameters)
-        std::ranges::copy(file.get_floats(parameter.name, parameter.shape),
-                          parameter.value.begin());  // others point there
+        // In place: the tape and the packed weights know a parameter by its address.
+        std::ranges::copy(file.get_floats(parameter.name, parameter.shape), parameter.value.begin());
 }
 
 // Errors: model.value names the tensor that holds a number no network can have.

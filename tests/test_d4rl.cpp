@@ -216,6 +216,8 @@ TEST(recorded_transitions_tell_the_bodies_that_made_them) {
     };
     CHECK(largest(rows, Physics::mujoco_2_2) < 1e-5);  // the observations of the file, in float
     CHECK(largest(rows, Physics::d4rl) > 1e-3);
+    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "choose these with --physics 2.2"));
+    CHECK(remarks_on(rows, hopper, "2.2").empty());
     Rows own;
     MujocoEnvironment environment(hopper, Physics::d4rl);
     own.state_dim = 11;
@@ -230,6 +232,9 @@ TEST(recorded_transitions_tell_the_bodies_that_made_them) {
     }
     CHECK(largest(own, Physics::d4rl) < 1e-4);
     CHECK(largest(own, Physics::mujoco_2_2) > 1e-3);
+    own.of_minari = true;  // which does not make them Gymnasium's
+    CHECK(remarks_on(own, hopper, "d4rl").empty());
+    CHECK(some_contain(remarks_on(own, hopper, "2.2"), "choose these with --physics d4rl"));
     own.observations[5] = 10;  // row 0: a velocity at its limit
     CHECK(transition_differences(own, hopper, Physics::d4rl).size() < 200);
     own.actions.assign(own.actions.size(), NAN);
@@ -305,12 +310,11 @@ TEST(positions_outside_the_maze_are_said_and_many_are_refused) {
 
 TEST(data_of_other_bodies_are_named_before_training) {
     const MujocoTask &hopper = *find_mujoco_task("hopper"), &ant = *find_mujoco_task("ant");
-    Rows rows;
-    rows.count = 2;
+    Rows rows;  // none, so that no step tells
     rows.state_dim = 11;
     CHECK(remarks_on(rows, hopper, "d4rl").empty());
     rows.of_minari = true;
-    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "--physics 2.2"));
+    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "if Gymnasium made the data"));
     CHECK(remarks_on(rows, hopper, "2.2").empty());
     CHECK(remarks_on(rows, *find_mujoco_task("antmaze-umaze-v2"), "d4rl").empty());
     rows.of_minari = false;
