@@ -35,7 +35,8 @@ inline const Option option_table[] = {
     {"train import trace", "--physics", "NAME", "",
      "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
     {"train import sweep check", "--dataset", "FILE", "",
-     "HDF5 in D4RL's or Minari's layout (default: by the task's name); random: none"},
+     "HDF5 in D4RL's or Minari's layout, or Minari's folder (default: by the task's name); random: none"},
+    {"train import", "--clip-actions", nullptr, "", "clip the data set's actions to [-1, 1], not refuse those beyond"},
     {"train", "--weights", "MODEL", "",
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
@@ -303,7 +304,7 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
             set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
         return;
     }
-    settings.dataset_path = given.empty() ? find_data_set(*published) : given;
+    settings.dataset_path = given.empty() ? find_data_set(*published) : data_set_file(given);
     settings.dataset_sha256 = sha256_of_file(settings.dataset_path);
     settings.dataset = std::filesystem::path(settings.dataset_path).filename();
     const bool original = published && settings.dataset_sha256 == published->sha256;
@@ -312,12 +313,13 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
 
 // What own data decide by themselves: sizes, the entropy's bound, and what a return is compared with. Errors: those of
 // load_own_data().
-inline void choose_own_data(Settings& settings, const std::string& path) {
+inline void choose_own_data(Settings& settings, const std::string& given) {
+    const std::string path = data_set_file(given);
     settings.dataset_path = path;
     settings.dataset_sha256 = sha256_of_file(path);
     settings.dataset = std::filesystem::path(path).filename();
     settings.source["dataset"] = "own data";
-    const OwnData data = load_own_data(path);
+    const OwnData data = load_own_data(path, settings.clip_actions);
     double best = -INFINITY, largest = 0;  // of the returns; of their absolute values
     for (const Trajectory& trajectory : data.trajectories) {
         const double total = returns_to_go(trajectory.rewards).front();
@@ -377,8 +379,9 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
         fail("usage.option", own ? "two data sets are given; to train on one of them for a task, name the task first"
                                  : "the grid world makes its own data set; leave --dataset out");
     }
-    if (own) choose_own_data(settings, task);
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
+    if (arguments.has("--clip-actions")) set_from(settings, "clip_actions", "yes", "command line");
+    if (own) choose_own_data(settings, task);
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
     settings.arithmetic = kernel_of(arguments).arithmetic;

@@ -8,7 +8,8 @@
 // d3rlpy 1 writes the same but for episode_terminals, N, in the place of timeouts: the last step of any episode.
 // A Minari file has a group for each episode, of T steps:
 //   episode_0/observations  T+1 x S | actions  T x A | rewards, terminations, truncations  T          episode_1/...
-// and in the attribute total_episodes says how many there are.
+// and in the attribute total_episodes says how many there are. Where observations are dictionaries, as in its mazes,
+// episode_0/observations is a group of tables, of which minari_states says which ones are the state.
 // Promises: every quirk of the published files is handled on purpose and said here; a file of another shape, with NaN
 // or of another task is refused with a sentence. Leaves out: how an HDF5 file is laid out (hdf5.hpp), writing.
 #pragma once
@@ -90,6 +91,18 @@ inline std::string file_name(const PublishedDataSet& set) { return std::filesyst
 
 constexpr const char* own_folder = "runs/datasets";
 
+// Returns the file of a data set: `given` itself, or that of the numbers in a folder of Minari's.
+// Errors: dataset.arrow for Minari's other form.
+inline std::string data_set_file(const std::string& given) {
+    if (!std::filesystem::is_directory(given)) return given;
+    for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
+        if (std::filesystem::exists(given + file)) return given + file;
+    for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow"})
+        require(!std::filesystem::exists(given + file), "dataset.arrow", given,
+                ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
+    return given;
+}
+
 // Returns D4RL's cache: the folder that its environment variable names, else one in the home folder.
 inline std::string d4rl_folder() {
     if (const char* folder = std::getenv("D4RL_DATASET_DIR"); folder && *folder) return folder;
@@ -123,6 +136,8 @@ struct Rows {
     std::vector<float> actions, rewards;                 // [count, action_dim], [count]
     std::vector<uint8_t> terminals, timeouts;            // [count]; timeouts may be empty
     bool integer_actions = false;                        // by their type in the file
+    bool of_minari = false;                              // the file's layout
+    std::string read_as = "";                            // what was chosen in reading it; "": nothing was to choose
 
     const float* observation(size_t row) const { return &observations[row * state_dim]; }
     bool ends(size_t row) const { return terminals[row] != 0 || (!timeouts.empty() && timeouts[row] != 0); }
@@ -140,8 +155,11 @@ inline Hdf5Table table_of(const Hdf5File& file, const std::string& name, std::op
     const Hdf5Dataset* found = file.find(name);
     const auto below = [&](const Hdf5Dataset& other) { return other.path.starts_with(name + "/"); };
     const bool is_group = !found && std::ranges::any_of(file.datasets, below);
-    require(!is_group, "dataset.shape", file.path, ": \"", name, "\" is a group; write one table of numbers instead");
+    require(!is_group, "dataset.shape", file.path, ": \"", name,
+            "\" is a group; write one table of numbers instead, or name a maze's task");
     require(found, "dataset.shape", file.path, ": has no data set \"", name, "\"; it is not in D4RL's layout");
+    require(found->unsupported.empty(), "hdf5.unsupported", dataset_place(file.path, name),
+            "cannot be read: ", found->unsupported);
     const Shape& shape = found->shape;
     const uint64_t width = shape.size() == 2 ? shape[1] : 1;
     const auto text = [](std::optional<uint64_t> n) { return n ? std::to_string(*n) : "any number"; };
@@ -167,8 +185,8 @@ inline void require_known_columns(const Hdf5File& file, uint64_t rows, const std
         const std::set<std::string> known = {"observations", "actions", "rewards", "terminals", "next_observations"};
         if (name.find('/') != std::string::npos || known.contains(name) || name == ends) continue;
         const Hdf5Dataset* column = file.find(name);
-        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column", file.path, ": \"", name,
-                "\" has a row for each step and is not read beside ", ends,
+        require(!column || column->shape.empty() || column->shape[0] != rows, "dataset.column",
+                dataset_place(file.path, name), "has a row for each step and is not read beside ", ends,
                 "; name what marks the ends of episodes timeouts, and move the rest to a group such as infos");
     }
 }
@@ -216,8 +234,8 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     std::set<uint64_t> episodes;
     for (const std::string& name : file.names()) {
         const std::optional<uint64_t> episode = minari_episode(name);
-        require(episode.has_value(), "dataset.column", file.path, ": \"", name,
-                "\" lies in none of Minari's groups episode_0, episode_1, ...");
+        require(episode.has_value(), "dataset.column", dataset_place(file.path, name),
+                "lies in none of Minari's groups episode_0, episode_1, ...");
         episodes.insert(*episode);
     }
     const auto stated = file.attributes.find("total_episodes");
@@ -227,27 +245,92 @@ inline std::set<uint64_t> minari_episodes(const Hdf5File& file) {
     return episodes;
 }
 
+// Of the dictionary observations of Minari's mazes (of Gymnasium-Robotics): the parts that make up a task's state.
+struct MinariState {
+    Rules rules;
+    std::vector<std::string> parts;  // below "observations"
+    const char* meaning;             // what was chosen, and how the two worlds differ
+};
+inline const MinariState minari_states[] = {
+    {Rules::antmaze,
+     {"/achieved_goal", "/observation"},
+     "the state is achieved_goal and observation; AntMaze counts positions from the middle of the map and y upwards, "
+     "antmaze from its start cell and y downwards; its ant pushes with up to 150 N m for 0.05 s, antmaze's with 30 N m "
+     "for 0.1 s; its goal has a radius of 0.45, not 0.5"},
+    {Rules::maze2d,
+     {"/observation"},
+     "the state is observation; PointMaze's positions, velocities and actions are turned and moved into maze2d's "
+     "coordinates; what remains: a touch of a wall ends 0.03 to 0.07 elsewhere, its goal has a radius of 0.45, not "
+     "0.5, and each episode has its own, to which the rewards belong"}};
+
+// Returns the parts of the dictionary observations in the group `name` that are the task's state; null where it is no
+// group, or the task has none.
+inline const MinariState* minari_state(const Hdf5File& file, const std::string& name, const MujocoTask* task) {
+    const auto of_task = [&](const MinariState& state) { return task && state.rules == task->rules; };
+    const auto found = std::ranges::find_if(minari_states, of_task);
+    return found != std::end(minari_states) && file.groups.contains(name) ? found : nullptr;
+}
+
+// Returns tables of so many rows side by side, row-major; each name is `group` and a part. Errors: those of table_of().
+inline std::vector<double> read_side_by_side(const Hdf5File& file, const std::string& group,
+                                             const std::vector<std::string>& parts, uint64_t rows) {
+    std::vector<std::vector<double>> tables;
+    for (const std::string& part : parts) tables.push_back(file.read<double>(table_of(file, group + part, rows).data));
+    std::vector<double> all;
+    for (uint64_t row = 0; row < rows; ++row)
+        for (const std::vector<double>& table : tables) {
+            const size_t width = table.size() / rows;
+            all.insert(all.end(), table.begin() + row * width, table.begin() + (row + 1) * width);
+        }
+    return all;
+}
+
+// Turns numbers of Minari's PointMaze-v3 into those of maze2d, whose map is the same: PointMaze's X and Y run along
+// columns and up the rows from the middle of the map, maze2d's x and y down rows and along columns (maze_place()).
+//   states, rows (X, Y, VX, VY):   (rows / 2 - 0.7 - Y, columns / 2 - 0.7 + X, -VY, VX)     actions (A, B):   (-B, A)
+inline void turn_to_maze2d(std::vector<double>& states, std::vector<float>& actions, const MujocoTask& task) {
+    const std::string_view map = task.maze;
+    const double top = static_cast<double>(std::ranges::count(map, '/')) / 2 - 0.7;
+    const double left = static_cast<double>(map.find('/')) / 2 - 0.7;
+    for (size_t i = 0; i + 4 <= states.size(); i += 4) {
+        const std::array<double, 4> s = {states[i], states[i + 1], states[i + 2], states[i + 3]};
+        std::ranges::copy(std::array{top - s[1], left + s[0], -s[3], s[2]}, &states[i]);
+    }
+    for (size_t i = 0; i + 2 <= actions.size(); i += 2) {
+        std::swap(actions[i], actions[i + 1]);
+        actions[i] = -actions[i];
+    }
+}
+
 // Reads Minari's episodes, one after the other. The observation after the last action becomes the last row's next one.
-// Errors: dataset.shape, those of minari_episodes() and hdf5.hpp.
-inline Rows read_minari(const Hdf5File& file) {
+// task: whose state dictionary observations are to give; null: they are refused. Errors: dataset.shape, those of
+// minari_episodes() and hdf5.hpp.
+inline Rows read_minari(const Hdf5File& file, const MujocoTask* task = nullptr) {
     Rows rows;
+    rows.of_minari = true;
     for (const uint64_t episode : minari_episodes(file)) {
         const std::string group = "episode_" + std::to_string(episode) + "/";
         const Hdf5Table actions = table_of(file, group + "actions");
         const uint64_t steps = actions.rows;
-        const Hdf5Table states = table_of(file, group + "observations", steps + 1);
-        if (rows.count == 0) rows.state_dim = states.columns;
+        const MinariState* dictionary = minari_state(file, group + "observations", task);
+        const std::vector<std::string> parts = dictionary ? dictionary->parts : std::vector<std::string>{""};
+        std::vector<double> states = read_side_by_side(file, group + "observations", parts, steps + 1);
+        const size_t columns = states.size() / (steps + 1);
+        if (rows.count == 0) rows.state_dim = columns;
         if (rows.count == 0) rows.action_dim = actions.columns;
         if (rows.count == 0) rows.integer_actions = is_integer(actions.data);
-        const bool empty = steps == 0 || states.columns == 0 || actions.columns == 0;
-        const bool alike = states.columns == rows.state_dim && actions.columns == rows.action_dim;
-        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ",
-                states.columns, " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim,
-                " and ", rows.action_dim, " columns");
-        const std::vector<float> all = file.read<float>(states.data);
+        const bool empty = steps == 0 || columns == 0 || actions.columns == 0;
+        const bool alike = columns == rows.state_dim && actions.columns == rows.action_dim;
+        require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ", columns,
+                " and ", actions.columns, " columns, ", steps, " steps; the first has ", rows.state_dim, " and ",
+                rows.action_dim, " columns");
+        std::vector<float> taken = file.read<float>(actions.data);
+        if (dictionary && task->rules == Rules::maze2d) turn_to_maze2d(states, taken, *task);
+        if (dictionary) rows.read_as = dictionary->meaning;
+        const std::vector<float> all(states.begin(), states.end());  // rounded to the nearest
         append_all(rows.observations, std::span(all).first(steps * rows.state_dim));
         append_all(rows.next_observations, std::span(all).last(steps * rows.state_dim));
-        append_all(rows.actions, file.read<float>(actions.data));
+        append_all(rows.actions, taken);
         append_all(rows.rewards, file.read<float>(column_of(file, group + "rewards", steps)));
         append_all(rows.terminals, file.read_flags(column_of(file, group + "terminations", steps)));
         append_all(rows.timeouts, file.read_flags(column_of(file, group + "truncations", steps)));
@@ -257,9 +340,9 @@ inline Rows read_minari(const Hdf5File& file) {
     return rows;
 }
 
-inline Rows read_data_set(const std::string& path) {
-    const Hdf5File file = open_hdf5(path);
-    return is_minari(file) ? read_minari(file) : read_rows(file);
+// task: as for read_minari().
+inline Rows read_data_set(const Hdf5File& file, const MujocoTask* task = nullptr) {
+    return is_minari(file) ? read_minari(file, task) : read_rows(file);
 }
 
 // True for a file with an HDF5 name, so that a damaged one is refused as such, or with an HDF5 superblock.
@@ -368,7 +451,8 @@ inline void require_sound(const Rows& rows, const std::string& path, float large
             const bool finite = std::isfinite(values[i]);
             const std::string found = text_of("\", row ", i / width, ", column ", i % width, " is ", values[i]);
             require(!finite, "dataset.action", path, ": \"", name, found,
-                    "; actions lie in [-1, 1]: is it of another task, or not scaled?");
+                    "; actions lie in [-1, 1]: is it of another task, or not scaled? Where they are commands that a "
+                    "machine cut off, --clip-actions does the same");
             require(finite, "dataset.not_finite", path, ": \"", name, found,
                     "; only finite numbers can be learned from");
         }
@@ -379,14 +463,134 @@ inline void require_sound(const Rows& rows, const std::string& path, float large
     require_all("rewards", rows.rewards, 1, any);
 }
 
-// The file's trajectories for a task, without returns. Errors: dataset.*, hdf5.*, file.*.
-// use_timeouts: cut where the file says so; else at the time limit, as in a file without timeouts (and at terminals).
+// Returns the rows whose position lies in no free cell of maze2d's map; of other tasks none.
+inline std::vector<size_t> rows_outside(const Rows& rows, const MujocoTask& task) {
+    std::vector<size_t> outside;
+    if (task.rules != Rules::maze2d) return outside;
+    const std::string_view map = task.maze;
+    const size_t width = map.find('/') + 1;
+    for (size_t row = 0; row < rows.count; ++row) {
+        const float* const state = rows.observation(row);
+        const MazePlace place = maze_place(task, state[0], state[1]);
+        const bool near = std::fabs(place.row) < 100 && std::fabs(place.column) < 100;  // never so for NaN
+        const long i = near ? std::lround(place.row) : -1, j = near ? std::lround(place.column) : -1;
+        const size_t cell = static_cast<size_t>(i) * width + static_cast<size_t>(j);
+        const bool on_map = i >= 0 && j >= 0 && static_cast<size_t>(j) + 1 < width && cell < map.size();
+        if (!on_map || map[cell] == '1') outside.push_back(row);
+    }
+    return outside;
+}
+
+// Takes up to 200 recorded steps, spread over the rows, again under these physics. Returns of each the largest
+// difference between the observation that follows and the recorded one, ascending; {} without MuJoCo. Left out: contact
+// forces, and rows whose next one is not known, whose velocities are clipped, or that the engine breaks down on. What
+// is not observed, x and for ant y, is taken for 0, which changes nothing.
+inline std::vector<double> transition_differences([[maybe_unused]] const Rows& rows,
+                                                  [[maybe_unused]] const MujocoTask& task,
+                                                  [[maybe_unused]] Physics physics) {
+    std::vector<double> differences;
+#ifdef WODTEM_MUJOCO
+    MujocoEnvironment environment(task, physics);
+    const auto hidden = task.first_position, positions = environment.model->nq - hidden;  // numbers of qpos
+    const auto observed = positions + environment.model->nv;
+    const size_t count = std::min<size_t>(rows.count, 200);
+    for (size_t k = 0; k < count; ++k) {
+        const size_t row = k * rows.count / count;
+        const float *state = rows.observation(row), *next = nullptr;
+        if (!rows.next_observations.empty()) next = &rows.next_observations[row * rows.state_dim];
+        if (!next && row + 1 < rows.count && !rows.ends(row)) next = rows.observation(row + 1);
+        const auto clipped = [&](float v) { return std::fabs(v) >= task.velocity_limit; };
+        if (!next || std::any_of(state + positions, state + observed, clipped)) continue;
+        std::vector<double> qpos(environment.model->nq);
+        std::copy(state, state + positions, qpos.begin() + hidden);
+        environment.start(qpos, std::vector<double>(state + positions, state + observed));
+        const float* const action = &rows.actions[row * rows.action_dim];
+        try {
+            environment.advance(std::vector<double>(action, action + rows.action_dim));
+        } catch (const Error&) {
+            continue;
+        }
+        double largest = 0;
+        for (int i = 0; i < observed; ++i) largest = std::max(largest, std::fabs(environment.observation[i] - next[i]));
+        differences.push_back(largest);
+    }
+    std::ranges::sort(differences);
+#endif
+    return differences;
+}
+
+// Returns what the recorded steps, or else the file's layout, tell of the bodies that made them; "" if it is those of
+// the chosen physics, or nobody knows. A tenth: of the two medians of transition_differences().
+inline std::string remark_on_bodies(const Rows& rows, const MujocoTask& task, const std::string& physics) {
+    const auto median = [&](Physics bodies) {
+        const std::vector<double> differences = transition_differences(rows, task, bodies);
+        return differences.empty() ? NAN : differences[differences.size() / 2];
+    };
+    const bool old = physics == "d4rl";
+    const double chosen = median(old ? Physics::d4rl : Physics::mujoco_2_2);
+    const double other = median(old ? Physics::mujoco_2_2 : Physics::d4rl);
+    const char* const name = old ? "2.2" : "d4rl";
+    if (10 * other < chosen)
+        return text_of("other bodies made these data: recorded steps taken again end ", chosen,
+                       " from the recorded state "
+                       "under physics ",
+                       physics, ", ", other, " under ", name, "; choose these with --physics ", name);
+    if (rows.of_minari && old && !(10 * chosen < other))
+        return "it is of Minari's layout: if Gymnasium made the data, its bodies are those of --physics 2.2; those of "
+               "physics d4rl, which train takes unless told otherwise, weigh up to 7.7% less and move otherwise";
+    return "";
+}
+
+// Returns what a user should know of a data set before training on it under these physics, a sentence each.
+inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& task, const std::string& physics) {
+    std::vector<std::string> remarks;
+    if (!rows.read_as.empty()) remarks.push_back(rows.read_as);
+    const std::string bodies = task.maze ? "" : remark_on_bodies(rows, task, physics);
+    if (!bodies.empty()) remarks.push_back(bodies);
+    const size_t with_contacts = 111, before_contacts = 27;  // ant's numbers
+    bool alive = false;
+    if (task.rules == Rules::ant && rows.state_dim == with_contacts)
+        for (size_t i = 0; i < rows.observations.size(); ++i)
+            alive = alive || (i % with_contacts >= before_contacts && rows.observations[i] != 0);
+    if (alive)
+        remarks.push_back(
+            "ant's contact forces (columns 27 to 110) are not 0, as they are in D4RL's data and in this "
+            "program: a policy would learn from numbers that it will never see");
+    if (const std::vector<size_t> outside = rows_outside(rows, task); !outside.empty())
+        remarks.push_back(text_of(outside.size(), " of ", rows.count, " positions lie in no free cell of ", task.name,
+                                  ", first in row ", outside[0],
+                                  ": is it of another maze, or PointMaze's in coordinates of "
+                                  "its own? Minari's own file of it is read in the right ones"));
+    return remarks;
+}
+
+// Clips the finite actions to [-1, 1] and says how many it changed.
+inline void clip_actions(Rows& rows, const std::string& path) {
+    size_t changed = 0;
+    for (float& action : rows.actions) {
+        if (std::fabs(action) <= 1 || !std::isfinite(action)) continue;
+        action = std::copysign(1.0f, action);
+        ++changed;
+    }
+    std::fprintf(stderr, "%s: %zu of %zu numbers of actions lay beyond 1 and were clipped\n", path.c_str(), changed,
+                 rows.actions.size());
+}
+
+// The file's trajectories for a task, without returns; what remarks_on() says goes to stderr. Of the settings it heeds
+// cut (flags: where the file says so; else at the time limit, as in a file without timeouts, and at terminals),
+// clip_actions and physics. Errors: dataset.*, hdf5.*, file.*; dataset.place if more than one position in a hundred is
+// outside the maze.
 inline std::vector<Trajectory> load_data_set(const std::string& path, const MujocoTask& task,
-                                             bool use_timeouts = true) {
-    Rows rows = read_data_set(path);
-    if (!use_timeouts) rows.timeouts.clear();
+                                             const Settings& settings = {}) {
+    Rows rows = read_data_set(open_hdf5(path), &task);
+    if (settings.cut != "flags") rows.timeouts.clear();
+    if (settings.clip_actions) clip_actions(rows, path);
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
+    const std::vector<std::string> remarks = remarks_on(rows, task, settings.physics);
+    if (rows_outside(rows, task).size() * 100 > rows.count)
+        throw Error("dataset.place", path + ": " + remarks.back());  // which is about them
+    for (const std::string& remark : remarks) std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
     return trajectories;
 }
 
@@ -409,9 +613,10 @@ inline int number_of_moves(const Rows& rows, const std::string& path) {
 }
 
 // Flags alone end trajectories, since no time limit is known. Errors: dataset.*, hdf5.*, file.*.
-inline OwnData load_own_data(const std::string& path) {
-    const Rows rows = read_data_set(path);
+inline OwnData load_own_data(const std::string& path, bool clip) {
+    Rows rows = read_data_set(open_hdf5(path));
     const int moves = number_of_moves(rows, path);
+    if (clip && moves == 0) clip_actions(rows, path);
     require_sound(rows, path, moves > 0 ? 10000.0f : 1 + 1e-5f);
     const int sizes_limit = 100000;
     require(rows.state_dim <= sizes_limit && rows.action_dim <= sizes_limit, "dataset.shape", path, ": has ",
@@ -432,7 +637,7 @@ inline bool is_held_out(size_t trajectory, double share) {
 // The trajectories of own data that are held out, or those that are not (the first is not), with their returns.
 // Errors: those of load_own_data().
 inline std::vector<Trajectory> part_of_own_data(const Settings& settings, bool held_out) {
-    OwnData data = load_own_data(settings.dataset_path);
+    OwnData data = load_own_data(settings.dataset_path, settings.clip_actions);
     std::vector<Trajectory> part;
     for (size_t i = 0; i < data.trajectories.size(); ++i) {
         if (is_held_out(i, settings.held_out) != held_out) continue;
@@ -484,7 +689,7 @@ inline std::vector<Trajectory> make_data_set(const Settings& settings) {
                                         static_cast<Behaviour>(index_of(behaviour_names, settings.behaviour)), seed,
                                         static_cast<int>(settings.data_trajectories));
     else if (settings.behaviour == "recorded")
-        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings.cut == "flags");
+        trajectories = load_data_set(settings.dataset_path, *find_mujoco_task(settings.task), settings);
     else
         for (uint64_t number = 0; trajectories.size() < static_cast<size_t>(settings.data_trajectories); ++number)
             if (auto trajectory = random_trajectory(*environment, seed, number))

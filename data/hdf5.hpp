@@ -5,11 +5,12 @@
 // Promises: what is read is what h5py reads; every checksum of what is read is verified; no input crashes or hangs the
 // reader or makes it allocate out of proportion; every error names the file, the object, the offset and what was
 // expected there. Leaves out: attributes but single numbers of the root group, compound, variable-length and other
-// types, filters but shuffle, deflate and fletcher32, external links, shared messages, virtual data sets (these data
-// sets are listed, and refused when read), layout messages before version 3 (HDF5 1.6.2 and older), reading a part of
-// the rows.
+// types, filters but shuffle, deflate, LZF and fletcher32, external links, shared messages, committed types, virtual
+// data sets (these data sets are listed, and refused by name when read), layout messages before version 3 (HDF5 1.6.2
+// and older), reading a part of the rows.
 #pragma once
 
+#include <deque>
 #include <set>
 
 #include "safetensors.hpp"
@@ -322,6 +323,32 @@ inline std::vector<uint8_t> inflate_zlib(Bytes in, size_t size) {
     return out;
 }
 
+// LZF, the filter that h5py brings along, as its library LibLZF describes it: runs of new bytes and references back.
+//   000nnnnn                       the next n + 1 bytes as they are
+//   nnnooooo [m] oooooooo          n from 1 to 6: n + 2 bytes once more, from o + 1 bytes back; n = 7: m more bytes
+// Returns the data, which must be `size` bytes. Errors: hdf5.lzf with what was found.
+inline std::vector<uint8_t> decompress_lzf(Bytes in, size_t size) {
+    std::vector<uint8_t> out;
+    out.reserve(size);
+    size_t at = 0;
+    const auto next = [&] {
+        require(at < in.size(), "hdf5.lzf", "the end of the compressed data");
+        return in[at++];
+    };
+    while (at < in.size()) {
+        const size_t head = next(), n = head >> 5;
+        const bool copies = n > 0;
+        size_t count = copies ? n + 2 : head + 1, back = 0;
+        if (n == 7) count += next();
+        if (copies) back = ((head & 31) << 8 | next()) + 1;
+        require(back <= out.size(), "hdf5.lzf", "a distance to before the start");
+        require(count <= size - out.size(), "hdf5.lzf", "more data than the chunk holds");
+        for (; count > 0; --count) out.push_back(copies ? out[out.size() - back] : next());
+    }
+    require(out.size() == size, "hdf5.lzf", "less data than the chunk holds");
+    return out;
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // What a file holds
 
@@ -342,6 +369,7 @@ T element_value(const Hdf5Element& element, const uint8_t* from) {
     if (element.kind == Hdf5Element::unsigned_integer) return static_cast<T>(bits);
     if (element.kind == Hdf5Element::signed_integer)
         return static_cast<T>(static_cast<int64_t>(bits << unused) >> unused);
+    if (element.size == 2) return static_cast<T>(half_value(static_cast<uint16_t>(bits)));
     if (element.size == 4) return static_cast<T>(std::bit_cast<float>(static_cast<uint32_t>(bits)));
     return static_cast<T>(std::bit_cast<double>(bits));
 }
@@ -361,7 +389,13 @@ struct Hdf5Chunk {
     Shape place = {};        // which one, in each dimension, of the data set's chunks; of data in one run: {}
 };
 
-enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3 };
+enum class Hdf5Filter : uint16_t { deflate = 1, shuffle = 2, fletcher = 3, lzf = 32000 };
+
+// The names of others, and how their data can be read all the same.
+constexpr std::pair<uint64_t, const char*> other_filters[] = {
+    {4, "szip"},      {5, "n-bit"},   {6, "scale-offset"},   {305, "LZO"},    {307, "bzip2"},
+    {32001, "Blosc"}, {32004, "LZ4"}, {32008, "bitshuffle"}, {32015, "Zstd"}, {32026, "Blosc2"}};
+constexpr const char* repack_advice = "; h5repack -f GZIP=4 OLD NEW (of HDF5's tools) writes a file that can be read";
 
 // All chunks of a data set have the same extents. Shape (4, 5) in chunks of (2, 2) has 2 times 3; the last chunk of
 // each row hangs over the edge. Each chunk is filtered by itself; one that is missing has the fill value.
@@ -385,10 +419,11 @@ struct Hdf5File {
     std::shared_ptr<const std::string> owner;       // of `bytes`
     Bytes bytes;                                    // the file from its superblock on; all addresses count from there
     std::vector<Hdf5Dataset> datasets;              // sorted by path, bytewise
-    std::map<std::string, std::string> links = {};  // soft and external: path -> what it leads to
+    std::map<std::string, std::string> links = {};  // soft, external, to a group met before: path -> where it leads
+    std::set<std::string> groups = {};              // paths; of one that several hard links lead to, the first
     std::map<std::string, double> attributes = {};  // of the root group, if a single number each
 
-    // Returns the data set of this path, which may lead through links; null if there is none.
+    // Returns the data set of this path, which may lead through links; null if there is none, or a group.
     // Errors: hdf5.link for a link to what is not in the file.
     const Hdf5Dataset* find(const std::string& name) const {
         std::string at = name;
@@ -398,7 +433,7 @@ struct Hdf5File {
             size_t end = at.find('/');  // of the part of `at` that is a link
             while (end != std::string::npos && !links.contains(at.substr(0, end))) end = at.find('/', end + 1);
             const auto link = links.find(at.substr(0, end));
-            if (link == links.end() && followed == 0) return nullptr;
+            if (link == links.end() && (followed == 0 || groups.contains(at))) return nullptr;
             if (link == links.end()) break;
             at = link->second + (end == std::string::npos ? "" : at.substr(end));
             if (at.starts_with('/')) at.erase(0, 1);  // a link to the root group
@@ -425,7 +460,7 @@ struct Hdf5File {
     }
 
     // Returns all elements, row-major, each rounded to the nearest T (beyond the range: infinity).
-    // Errors: hdf5.unsupported, hdf5.type, hdf5.deflate, hdf5.checksum, hdf5.format.
+    // Errors: hdf5.unsupported, hdf5.type, hdf5.deflate, hdf5.lzf, hdf5.checksum, hdf5.format.
     template <class T>
     std::vector<T> read(const Hdf5Dataset& dataset) const {
         const Hdf5Element& element = dataset.element;
@@ -455,7 +490,9 @@ struct Hdf5File {
         Bytes data = bytes.subspan(chunk.address, chunk.size);
         try {
             for (const Hdf5Filter filter : std::views::reverse(filters)) {
-                if (filter == Hdf5Filter::deflate) buffer = inflate_zlib(data, dataset.chunk_bytes + 4 * sums);
+                const size_t size = dataset.chunk_bytes + 4 * sums;  // before it was compressed
+                if (filter == Hdf5Filter::deflate) buffer = inflate_zlib(data, size);
+                if (filter == Hdf5Filter::lzf) buffer = decompress_lzf(data, size);
                 if (filter == Hdf5Filter::shuffle) buffer = unshuffled(data, dataset.element.size);
                 data = filter == Hdf5Filter::fletcher ? without_checksum(data) : buffer;
                 sums -= filter == Hdf5Filter::fletcher;
@@ -533,13 +570,14 @@ inline bool has_superblock(const std::string& path) {
     return superblock_place(file.size(), peek).has_value();
 }
 
-// Links in a circle, or one structure used again and again, end when more has been read than `budget`, a few times the
-// size of the file; this also bounds what is allocated. Depths are bounded where they occur.
+// Structures that refer to each other in a circle end when more has been read than `budget`, a few times the size of
+// the file; this also bounds what is allocated. A group is visited once, whatever hard links lead to it.
 struct Hdf5Parser {
     Hdf5File& file;
     size_t budget = 16 * file.bytes.size() + (1 << 21);
-    std::string object = "superblock";  // being read, for messages
-    std::set<uint64_t> groups = {};     // addresses already visited
+    std::string object = "superblock";                          // being read, for messages
+    std::map<uint64_t, std::string> groups = {};                // visited: address -> path
+    std::deque<std::pair<std::string, uint64_t>> objects = {};  // to visit: path, address
 
     // Fails with what was expected at this offset, unless the condition holds.
     void require_at(uint64_t offset, bool holds, const char* id, const auto&... expected) const {
@@ -635,7 +673,8 @@ struct Hdf5Parser {
         require(end <= all.size(), "hdf5.truncated", file.path, ": has ", all.size(), " bytes, its superblock says ",
                 end, "; the file was cut off");
         if (version >= 2) c.checksum();
-        link("", root, 0);
+        objects.push_back({"", root});
+        for (; !objects.empty(); objects.pop_front()) visit(objects.front().first, objects.front().second);
         std::ranges::sort(file.datasets, {}, &Hdf5Dataset::path);
     }
 
@@ -697,15 +736,19 @@ struct Hdf5Parser {
     };
     using Links = std::vector<Link>;
 
-    // Reads the data set or group that a link leads to. A link to a named type is passed over.
-    void link(const std::string& path, uint64_t address, int depth) {
+    // Reads the data set or group of this path. What a group holds is visited later, so that of several paths to a
+    // group the shortest becomes its own, and the others are links to it. A named type is passed over, as is what lies
+    // so deep that its path has more than 4096 bytes.
+    void visit(const std::string& path, uint64_t address) {
         object = path.empty() ? "root group" : json_string(path);
-        require_at(address, depth <= 32 && path.size() <= 4096, "hdf5.cycle", "at most 32 groups in each other");
         const std::vector<Message> header = messages(address);
         const auto has = [&](uint64_t type) { return std::ranges::find(header, type, &Message::type) != header.end(); };
         if (has(0x08)) return dataset(path, header);
         if (!has(0x11) && !has(0x02)) return;
-        require_at(address, groups.insert(address).second, "hdf5.cycle", "a group that is linked to once");
+        const auto [known, first_visit] = groups.emplace(address, path);
+        if (!first_visit) file.links[path] = known->second;
+        if (!first_visit) return;
+        file.groups.insert(path);
         Links links;
         for (const Message& message : header) {
             if (message.type == 0x11) symbol_table(links, message.data);
@@ -714,15 +757,15 @@ struct Hdf5Parser {
             if (message.type == 0x0C && path.empty() && (message.flags & 2) == 0) attribute(message.data);
         }
         for (const auto& [name, child, to] : links) {
-            const bool plain = !name.empty() && !has_control(name) && name.find('/') == std::string::npos;
-            require_at(address, plain, "hdf5.format", "names without slashes and control characters");
+            const bool plain = !name.empty() && name.find('/') == std::string::npos;
+            require_at(address, plain, "hdf5.format", "names without slashes");
             const std::string parent = path.empty() ? "" : path + "/";
-            if (!to) {
-                link(parent + name, child, depth + 1);
-                continue;
-            }
-            charge(address, 2 * parent.size() + name.size() + to->size());
-            file.links[parent + name] = plain_path(to->starts_with('/') ? *to : parent + *to);
+            if (parent.size() + name.size() > 4096) continue;
+            charge(address, 2 * parent.size() + name.size() + (to ? to->size() : 0));
+            if (to)
+                file.links[parent + name] = plain_path(to->starts_with('/') ? *to : parent + *to);
+            else
+                objects.push_back({parent + name, child});
         }
     }
 
@@ -962,23 +1005,25 @@ struct Hdf5Parser {
     void dataset(const std::string& path, const std::vector<Message>& header) {
         Grid g;
         g.path = path;
-        const auto each = [&](uint64_t type, const auto& read) {
+        const auto each = [&](uint64_t type, const char* part, const auto& read) {
             for (const Message& message : header) {
                 if (message.type != type) continue;
-                if ((message.flags & 2) != 0)
-                    g.unsupported = "its header shares a message with other objects";
-                else
+                if ((message.flags & 2) == 0)
                     read(message.data);
+                else if (g.unsupported.empty())
+                    g.unsupported = text_of("its ", part, " is shared with other objects (a committed type, or shared ",
+                                            "messages); write the data anew, with h5py as create_dataset(NAME, "
+                                            "data=OLD[NAME][:])");
             }
         };
-        each(0x01, [&](Cursor c) { dataspace(g, c); });
-        each(0x03, [&](Cursor c) { datatype(g, c); });
-        each(0x07, [&](Cursor) { g.unsupported = "its data are in another file"; });
-        each(0x0B, [&](Cursor c) { filter_pipeline(g, c); });
+        each(0x01, "shape", [&](Cursor c) { dataspace(g, c); });
+        each(0x03, "type", [&](Cursor c) { datatype(g, c); });
+        each(0x07, "list of files", [&](Cursor) { g.unsupported = "its data are in another file"; });
+        each(0x0B, "list of filters", [&](Cursor c) { filter_pipeline(g, c); });
         if (g.element.kind == Hdf5Element::other && g.unsupported.empty())
             g.unsupported = "elements of type " + g.type + " are not supported";
-        each(0x05, [&](Cursor c) { fill_value(g, c); });
-        each(0x08, [&](Cursor c) {
+        each(0x05, "fill value", [&](Cursor c) { fill_value(g, c); });
+        each(0x08, "layout", [&](Cursor c) {
             charge(c.start, sizeof(Hdf5Dataset) + path.size());
             c.expect(g.chunk_bytes == 0, "one layout message");
             if (g.unsupported.empty()) layout(g, c);
@@ -1009,6 +1054,7 @@ struct Hdf5Parser {
     //   class 1, floats        flags: 1 big-endian, 0x20 hidden bit, sign's place from bit 8 on
     //                          properties: first bit 2, bits 2, exponent: place, bits; mantissa: place, bits; bias 4
     //   class 3, strings       flags: padding
+    //   class 4, bit fields    flags: 1 big-endian   properties: first bit 2, bits 2; PyTables' bool is of one byte
     //   class 8, enumerations  flags: members     properties: integer type, names, values; h5py's bool is FALSE, TRUE
     void datatype(Hdf5Dataset& d, Cursor c) {
         const auto [head, flags, size] = c.fields(1, 3, 4);
@@ -1017,6 +1063,7 @@ struct Hdf5Parser {
         c.expect(version >= 1 && version <= 5 && size > 0, "a data type of version 1 to 5");
         d.element = {.size = size};
         d.type = type == 6 ? "compound" : type == 9 ? "variable length" : "class " + std::to_string(type);
+        if (type == 1) d.type = "floating point of " + std::to_string(size) + " bytes";
         if (type == 0) {
             const auto [first, precision] = c.fields(2, 2);
             if (size > 8 || first != 0 || precision != 8 * size) return;
@@ -1024,9 +1071,11 @@ struct Hdf5Parser {
             d.element.kind = has_sign ? Hdf5Element::signed_integer : Hdf5Element::unsigned_integer;
             d.type = (has_sign ? "int" : "uint") + bits;
         } else if (type == 1) {
+            constexpr std::array<uint8_t, 12> half = {0, 0, 16, 0, 10, 5, 0, 10, 15, 0, 0, 0};
             constexpr std::array<uint8_t, 12> single = {0, 0, 32, 0, 23, 8, 0, 23, 127, 0, 0, 0};
             constexpr std::array<uint8_t, 12> twice = {0, 0, 64, 0, 52, 11, 0, 52, 255, 3, 0, 0};
-            const bool ieee = (size == 4 || size == 8) && std::ranges::equal(c.take(12), size == 4 ? single : twice);
+            const bool known = size == 2 || size == 4 || size == 8;
+            const bool ieee = known && std::ranges::equal(c.take(12), size == 2 ? half : size == 4 ? single : twice);
             if (!ieee || (flags & 0x70) != 0x20 || flags >> 8 != 8 * size - 1) return;
             d.element.kind = Hdf5Element::floating;
             d.type = "float" + bits;
@@ -1034,6 +1083,11 @@ struct Hdf5Parser {
             if ((flags & 15) > 2) return;
             d.element.kind = Hdf5Element::text;
             d.type = "text of " + std::to_string(size) + " bytes";
+        } else if (type == 4) {
+            const auto [first, precision] = c.fields(2, 2);
+            if (size != 1 || first != 0 || precision != 8) return;
+            d.element.kind = Hdf5Element::unsigned_integer;
+            d.type = "bit field of 8";
         } else if (type == 8) {
             Cursor base = c;
             if ((base.number(1) & 15) != 0) return;
@@ -1072,14 +1126,18 @@ struct Hdf5Parser {
             const auto [flags, values] = c.fields(2, 2);
             c.take(version == 1 ? quotient(name, 8) * 8 : name);
             c.take(4 * (version == 1 ? quotient(values, 2) * 2 : values));
-            if (id < 1 || id > 3) d.unsupported = "filter " + std::to_string(id) + " is not supported";
+            const auto other = std::ranges::find(other_filters, id, &std::pair<uint64_t, const char*>::first);
+            const std::string known_as = other == std::end(other_filters) ? "" : text_of(" (", other->second, ")");
+            if ((id < 1 || id > 3) && id != 32000)
+                d.unsupported = "filter " + std::to_string(id) + known_as + " is not supported" + repack_advice;
             d.filters.push_back(static_cast<Hdf5Filter>(id));
         }
-        if (std::ranges::count(d.filters, Hdf5Filter::deflate) > 1) d.unsupported = "it is compressed twice";
+        if (std::ranges::count(d.filters, Hdf5Filter::deflate) + std::ranges::count(d.filters, Hdf5Filter::lzf) > 1)
+            d.unsupported = std::string("it is compressed twice") + repack_advice;
     }
 
-    // SPEC IV.A.2.i, versions 3 and 4. HDF5 2.0 writes 5, which differs in the width of a size in an index alone; the
-    // index itself tells that width.
+    // SPEC IV.A.2.i, versions 3 and 4. HDF5 2.0.0 knows 5, but writes 4 under libver latest and v200 too; 5 differs in
+    // the width of a size in an index alone, and the index itself tells that width.
     //   class 0, compact      size 2 | data
     //   class 1, contiguous   address 8 | size 8
     //   class 2, version 3    rank + 1 | B-tree 8 | chunk extents 4 each, then the element's size
@@ -1089,6 +1147,8 @@ struct Hdf5Parser {
         const auto [version, kind] = c.fields(1, 1);
         if (version < 3 || version > 5 || kind > 2) {
             g.unsupported = "its layout is of version " + std::to_string(version) + ", class " + std::to_string(kind);
+            if (kind == 3) g.unsupported = "its layout is virtual: the data are in other data sets or files";
+            g.unsupported += repack_advice;
             return;
         }
         const uint64_t total = bounded(g.elements, g.element.size, c);

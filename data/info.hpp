@@ -39,8 +39,8 @@ inline void print_data_set(const std::string& path, std::string id) {
     }
     print_datasets(file);
     if (!is_minari(file) && !file.find("observations")) return;
-    const Rows rows = is_minari(file) ? read_minari(file) : read_rows(file);
     const MujocoTask* task = find_mujoco_task(id);
+    const Rows rows = read_data_set(file, task);
     if (!task)
         std::printf("The name tells no task, so there is no score, and flags alone end trajectories (see --task)\n");
     const std::vector<Trajectory> trajectories = task ? cut_trajectories(rows, *task, path) : cut_at_flags(rows, 1000);
@@ -50,6 +50,15 @@ inline void print_data_set(const std::string& path, std::string id) {
     if (task)
         std::printf("mean normalised score of a trajectory: %.2f (%s)\n",
                     normalised_score(*task, statistics.returns.mean()), task->name);
+    for (const Physics physics : {Physics::d4rl, Physics::mujoco_2_2}) {
+        const std::vector<double> found = task ? transition_differences(rows, *task, physics) : std::vector<double>();
+        if (found.empty()) continue;
+        std::printf(
+            "physics %-4s %zu recorded steps taken again end %.2g from the recorded state (median), at most %.2g\n",
+            physics_names[static_cast<size_t>(physics)], found.size(), found[found.size() / 2], found.back());
+    }
+    if (task)
+        for (const std::string& remark : remarks_on(rows, *task, "d4rl")) std::printf("note: %s\n", remark.c_str());
     print_published(find_published(id));
 }
 
@@ -58,8 +67,7 @@ inline void print_data_set(const std::string& path, std::string id) {
 
 // Least, greatest and mean of the finite numbers, and the count of the others.
 template <class T>
-std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
-    std::vector<T> values = file.get<T>(tensor.name, tensor.shape);
+std::string value_range(std::vector<T> values) {
     const size_t others = std::erase_if(values, [](T x) { return !std::isfinite(static_cast<double>(x)); });
     if (values.empty()) return "nothing finite";
     Moments finite;
@@ -69,11 +77,14 @@ std::string value_range(const TensorFile& file, const StoredTensor& tensor) {
     return text + (others > 0 ? ", NOT FINITE: " + std::to_string(others) : std::string());
 }
 
-// Of a tensor whose type is one of Types; "" for any other.
+// Of a tensor whose type is one of Types, or has 16 bits; "" for any other.
 template <class... Types>
 std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
     std::string range;
-    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range<Types>(file, tensor)) : void()), ...);
+    if (tensor.dtype == DType::F16 || tensor.dtype == DType::BF16) range = value_range(file.numbers(tensor));
+    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range(file.get<Types>(tensor.name, tensor.shape)))
+                                        : void()),
+     ...);
     return range;
 }
 
@@ -94,7 +105,8 @@ inline void print_tensors(const std::string& path) {
 }
 
 // The command `info`. task: a task's id, or "".
-inline void print_info(const std::string& path, const std::string& task) {
+inline void print_info(const std::string& given, const std::string& task) {
+    const std::string path = data_set_file(given);
     if (is_hdf5(path))
         print_data_set(path, task.empty() ? "" : full_task_name(task));
     else

@@ -56,8 +56,8 @@ inline std::string some_names(const std::vector<std::string>& names) {
     return text + (names.size() > 8 ? " and " + std::to_string(names.size() - 8) + " more" : "");
 }
 
-// Reads the parameters. Beside them the file may have the tensors `known`, and no others.
-// Errors: model.names names the missing and the unknown ones; those of read_into() for a wrong shape or dtype.
+// Reads the parameters, of any kind of float. Beside them the file may have the tensors `known`, and no others.
+// Errors: model.names names the missing and the unknown ones; those of get_floats() for a wrong shape or dtype.
 inline void load_parameters(ModelContents& model, const TensorFile& file, std::set<std::string> known) {
     std::vector<std::string> missing, unknown;
     for (const Parameter<float>& parameter : model.parameters) {
@@ -71,7 +71,8 @@ inline void load_parameters(ModelContents& model, const TensorFile& file, std::s
     require(differences.empty(), "model.names", file.path, ": does not hold the network of its settings: ", differences,
             "; are layers, position and method right?");
     for (Parameter<float>& parameter : model.parameters)
-        file.read_into(std::span(parameter.value), parameter.name, parameter.shape);
+        // In place: the tape and the packed weights know a parameter by its address.
+        std::ranges::copy(file.get_floats(parameter.name, parameter.shape), parameter.value.begin());
 }
 
 // Errors: model.value names the tensor that holds a number no network can have.
@@ -139,7 +140,7 @@ inline Settings settings_in(const TensorFile& file) { return settings_from_text(
 // Errors: model.settings.
 inline void require_room(const TensorFile& file, const Settings& settings) {
     const int64_t weights = 12 * settings.layers * settings.width * settings.width;
-    const bool enough = static_cast<uint64_t>(weights) <= file.buffer.size() / sizeof(float);
+    const bool enough = static_cast<uint64_t>(weights) <= file.buffer.size() / about(DType::F16).size;
     require(settings.width % settings.heads == 0 && enough, "model.settings", file.path, ": does not hold the ",
             weights, " weights and more that its settings call for");
 }
@@ -211,7 +212,7 @@ inline std::vector<std::pair<std::string, Shape>> unused_odt_tensors(const Trans
 // file has neither. Errors: import.metadata.
 inline std::vector<float> tensor_or_text(const TensorFile& file, const std::string& name, const Shape& shape) {
     const size_t size = shape.empty() ? 1 : shape[0];
-    if (file.has(name)) return file.get<float>(name, shape);
+    if (file.has(name)) return file.get_floats(name, shape);
     if (!file.metadata.contains(name)) return {};
     std::vector<float> values;
     bool finite = true;

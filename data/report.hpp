@@ -246,6 +246,9 @@ inline Run read_run(const std::string& folder) {
     run.folder = folder;
     run.settings = settings_from_text(read_file(file("settings")), file("settings"));
     run.usual = default_settings(run.settings.task, run.settings.method, run.settings.preset);
+    for (const SettingRow& row : setting_rows)  // what own data decide is usual for them
+        if (run.own() && source_of(run.settings, row) != "command line")
+            set_setting(run.usual, row.name, setting_text(run.settings, row));
     run.command = exists("command") ? split(read_file(file("command")), '\n')[0] : train_command(run.settings);
     run.identity = identity_of(run.settings);
     while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these

@@ -278,13 +278,22 @@ inline bool is_utf8(std::string_view text) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Tensors
 
-enum class DType : uint8_t { F32, F64, U8, U32, U64, I32, I64, BOOL };
+// Returns the number that 16 bits stand for as IEEE 754's binary16: sign, 5 bits of exponent, 10 of fraction.
+inline float half_value(uint16_t bits) {
+    const int exponent = bits >> 10 & 31, fraction = bits & 1023;
+    const int significand = exponent == 0 ? fraction : 1024 + fraction;
+    float magnitude = std::ldexp(static_cast<float>(significand), std::max(exponent, 1) - 25);
+    if (exponent == 31) magnitude = fraction == 0 ? INFINITY : NAN;
+    return bits >> 15 != 0 ? -magnitude : magnitude;
+}
+
+enum class DType : uint8_t { F32, F64, F16, BF16, U8, U32, U64, I32, I64, BOOL };
 struct DTypeInfo {
     const char* name;
     size_t size;  // bytes of one element
 };
-inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"U8", 1},  {"U32", 4},
-                                       {"U64", 8}, {"I32", 4}, {"I64", 8}, {"BOOL", 1}};
+inline constexpr DTypeInfo dtypes[] = {{"F32", 4}, {"F64", 8}, {"F16", 2}, {"BF16", 2}, {"U8", 1},
+                                       {"U32", 4}, {"U64", 8}, {"I32", 4}, {"I64", 8},  {"BOOL", 1}};
 inline const DTypeInfo& about(DType dtype) { return dtypes[static_cast<size_t>(dtype)]; }
 
 // A DType's name is a letter for the kind and the number of bits. For a type that has none this does not compile.
@@ -377,6 +386,13 @@ struct TensorFile {
         if (!given.empty()) buffer.append(reinterpret_cast<const char*>(given.data()), given.size_bytes());
     }
 
+    // Errors: safetensors.shape, also if the caller expects another number of elements than the file has.
+    void require_shape(const StoredTensor& tensor, const Shape& shape, size_t elements) const {
+        const bool same = tensor.shape == shape && tensor.size == elements * about(tensor.dtype).size;
+        require(same, "safetensors.shape", tensor_place(path, tensor.name), " has shape ", shape_text(tensor.shape),
+                ", expected ", shape_text(shape), " (", elements, " elements); made with other settings?");
+    }
+
     // Copies tensor `name` to `out`. Errors: safetensors.missing; safetensors.dtype and safetensors.shape if the type,
     // the shape or the number of elements is not the stored one.
     template <class T>
@@ -385,9 +401,7 @@ struct TensorFile {
         const std::string place = tensor_place(path, name);
         require(tensor.dtype == dtype_of<T>(), "safetensors.dtype", place, " has dtype ", about(tensor.dtype).name,
                 ", expected ", about(dtype_of<T>()).name);
-        require(tensor.shape == shape && tensor.size == out.size_bytes(), "safetensors.shape", place, " has shape ",
-                shape_text(tensor.shape), ", expected ", shape_text(shape), " (", out.size(),
-                " elements); made with other settings?");
+        require_shape(tensor, shape, out.size());
         if (!out.empty()) std::memcpy(out.data(), bytes(tensor).data(), tensor.size);  // the file need not be aligned
     }
 
@@ -396,6 +410,40 @@ struct TensorFile {
         std::vector<T> out(find(name).size / sizeof(T));
         read_into(std::span(out), name, shape);
         return out;
+    }
+
+    // Returns the numbers of a tensor of any kind of float, exactly; of another tensor none.
+    std::vector<double> numbers(const StoredTensor& tensor) const {
+        const std::string_view from = bytes(tensor);
+        const size_t width = about(tensor.dtype).size;
+        const auto all = [&](auto stored, const auto& value) {
+            std::vector<double> out;
+            for (size_t at = 0; at < from.size(); at += width) {
+                std::memcpy(&stored, &from[at], width);
+                out.push_back(value(stored));
+            }
+            return out;
+        };
+        if (tensor.dtype == DType::F32) return all(0.0f, [](float x) { return x; });
+        if (tensor.dtype == DType::F64) return all(0.0, [](double x) { return x; });
+        if (tensor.dtype == DType::F16) return all(uint16_t{0}, half_value);
+        if (tensor.dtype != DType::BF16) return {};
+        return all(uint16_t{0}, [](uint16_t bits) { return std::bit_cast<float>(uint32_t{bits} << 16); });
+    }
+
+    // Returns a tensor of any kind of float, each number rounded to the nearest float. Errors: those of read_into() but
+    // for these types; safetensors.range for a finite number beyond those of float.
+    std::vector<float> get_floats(const std::string& name, const Shape& shape) const {
+        const StoredTensor& tensor = find(name);
+        const bool other_float = tensor.dtype > DType::F32 && tensor.dtype <= DType::BF16;
+        if (!other_float) return get<float>(name, shape);
+        const std::vector<double> values = numbers(tensor);
+        require_shape(tensor, shape, values.size());
+        for (size_t i = 0; i < values.size(); ++i)
+            require(!std::isfinite(values[i]) || std::isfinite(static_cast<float>(values[i])), "safetensors.range",
+                    tensor_place(path, name), ": element ", i, " is ", values[i],
+                    ", beyond the numbers of float, to which ", about(tensor.dtype).name, " is converted");
+        return {values.begin(), values.end()};
     }
 };
 
@@ -542,7 +590,7 @@ inline DType dtype_named(const std::string& dtype, const std::string& place) {
     for (size_t i = 0; i < std::size(dtypes); ++i)
         if (dtype == dtypes[i].name) return static_cast<DType>(i);
     throw Error("safetensors.dtype", place + " has dtype " + json_string(dtype.substr(0, 80)) +
-                                         ", known are F32 F64 U8 U32 U64 I32 I64 BOOL; convert it first");
+                                         ", known are F32 F64 F16 BF16 U8 U32 U64 I32 I64 BOOL; convert it first");
 }
 
 // Reads {"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}. std::exchange() returns what the field held before, so a

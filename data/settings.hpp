@@ -155,7 +155,7 @@ struct Settings {
 
     int64_t online_steps = 20000, buffer_size = 500, eval_episodes = 1, eval_every = 10;
     double g_online = 2, g_eval = 1, reward_scale = 1;
-    bool keep_lowest = false;
+    bool keep_lowest = false, clip_actions = false;
     std::string sampling = "uniform", cut = "flags";
     double held_out = 0;
 
@@ -244,6 +244,7 @@ inline const SettingRow setting_rows[] = {
      "chosen: so ODT ends near the paper's 7; DT's and ODT's code: by_length"},
     {"cut", &Settings::cut, 0, 0, "flags|episodes",
      "D4RL's and ODT's code; episodes (maze2d): at the time limit alone"},
+    {"clip_actions", &Settings::clip_actions, 0, 0, "", "chosen: recorded actions beyond 1 are refused"},
     {"held_out", &Settings::held_out, 0, 0.9, "", "the paper trains on all trajectories"},
     // Episodic memory.
     {"gamma", &Settings::gamma, 0, 1, "", "WODTEM sec. V-D: discount of d"},
@@ -456,6 +457,8 @@ inline void check_together(const Settings& settings) {
         fail("usage.setting", "online_steps must be 0, not %lld: own data have no environment", online_steps);
     if (!own && settings.held_out > 0)
         fail("usage.setting", "held_out is for own data; others are evaluated by acting");
+    if (settings.clip_actions && (gridworld || settings.moves > 0))
+        fail("usage.setting", "the actions are moves, which cannot be clipped: clip_actions must be no");
     if ((gridworld || own) != (settings.physics == "none"))
         fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
              gridworld || own ? "none: there are no bodies" : "d4rl or 2.2");
@@ -501,9 +504,16 @@ inline std::string source_of(const Settings& settings, const SettingRow& row) {
     return source == settings.source.end() ? row.source : source->second;
 }
 
+// A setting that came later: files do not have it where it is at its initial value, and so are as they were before.
+inline bool is_later(const SettingRow& row) {
+    constexpr std::string_view later[] = {"clip_actions", "held_out", "state_dim", "action_dim", "moves"};
+    return contains(later, row.name);
+}
+
 inline std::string settings_text(const Settings& settings) {
     std::string text;
     for (const SettingRow& row : setting_rows) {
+        if (is_later(row) && setting_text(settings, row) == setting_text({}, row)) continue;
         std::string line = std::string(row.name) + " = " + quoted(setting_text(settings, row));
         line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
         text += line + "# " + source_of(settings, row) + "\n";
@@ -553,7 +563,7 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
         }
     }
     for (const SettingRow& row : setting_rows)
-        if (!settings.source.contains(row.name))
+        if (!settings.source.contains(row.name) && !is_later(row))
             fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
                  row.name);
     return settings;

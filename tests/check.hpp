@@ -62,6 +62,7 @@ struct Array {
 
 // The entries of a tensor as long doubles, which hold every number of every type exactly.
 std::vector<long double> entries(const TensorFile& file, const StoredTensor& tensor) {
+    if (const std::vector<double> floats = file.numbers(tensor); !floats.empty()) return {floats.begin(), floats.end()};
     std::vector<long double> values(tensor.size / about(tensor.dtype).size);
     const auto read = [&](auto x) {
         for (size_t i = 0; i < values.size(); ++i) {
@@ -70,12 +71,6 @@ std::vector<long double> entries(const TensorFile& file, const StoredTensor& ten
         }
     };
     switch (tensor.dtype) {
-        case DType::F32:
-            read(float{});
-            break;
-        case DType::F64:
-            read(double{});
-            break;
         case DType::U32:
             read(uint32_t{});
             break;

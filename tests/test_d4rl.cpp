@@ -2,7 +2,7 @@
 // its name among the settings.
 #include <unistd.h>
 
-#include "../data/d4rl.hpp"
+#include "../data/info.hpp"
 #include "test.hpp"
 
 namespace {
@@ -59,7 +59,7 @@ TEST(episodes_of_minari_become_rows_and_each_ends_a_trajectory) {
     };
     write(2, 1);
     CHECK(is_hdf5(path));
-    const Rows rows = read_data_set(path);
+    const Rows rows = read_data_set(open_hdf5(path));
     CHECK_EQUAL(rows.count, size_t{3});
     CHECK_EQUAL(rows.state_dim, size_t{2});
     CHECK(rows.observations == (std::vector<float>{1, 2, 3, 4, 1, 2}));
@@ -68,14 +68,14 @@ TEST(episodes_of_minari_become_rows_and_each_ends_a_trajectory) {
     CHECK_EQUAL(cut_at_flags(rows, 1000).size(), size_t{2});
     for (const auto& [columns, steps] : {std::pair(1, 2), {3, 1}, {0, 1}, {2, 0}}) {
         write(static_cast<uint64_t>(columns), static_cast<uint64_t>(steps));
-        CHECK_FAILS("dataset.shape", read_data_set(path));
+        CHECK_FAILS("dataset.shape", read_data_set(open_hdf5(path)));
     }
     {
         Hdf5Writer out(path);
         out.add("observations", {2, 1, 1}, std::array{1.0f, 2.0f});
         out.close();
     }
-    CHECK_FAILS("dataset.shape", read_data_set(path));
+    CHECK_FAILS("dataset.shape", read_data_set(open_hdf5(path)));
     const std::string whole = read_file(path);
     write_file_atomic(path, std::string(1024, ' ') + whole);  // a user block
     CHECK(is_hdf5(path));
@@ -148,8 +148,182 @@ TEST(episodes_of_minari_whose_numbers_have_gaps_are_all_read) {
     } catch (const Error& error) {
         CHECK(std::string(error.what())
                   .ends_with("\"episode_2/observations\" is a group; write one table of numbers "
-                             "instead"));
+                             "instead, or name a maze's task"));
     }
+}
+
+namespace {
+
+// A file that Minari wrote: tests/hdf5/NAME.z, as make.py says.
+Hdf5File file_of_minari(const std::string& name) {
+    const std::string packed = read_file("tests/hdf5/" + name + ".z");
+    const auto bytes = inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8)));
+    return parse_hdf5(std::string(bytes.begin(), bytes.end()), name);
+}
+
+bool some_contain(const std::vector<std::string>& sentences, const std::string& part) {
+    return std::ranges::any_of(sentences, [&](const auto& one) { return one.find(part) != std::string::npos; });
+}
+
+}  // namespace
+
+// The map has 8 rows and 8 columns, whose middle is at 4, so x = 4 - 0.7 - Y and y = 4 - 0.7 + X: by hand for one row,
+// by the engine for each: where no wall is near, our ball moves as Minari's did.
+TEST(pointmaze_of_minari_is_maze2d_turned_and_moved) {
+    const MujocoTask& task = *find_mujoco_task("maze2d-medium-v1");
+    const Hdf5File file = file_of_minari("pointmaze");
+    const Rows rows = read_minari(file, &task);
+    CHECK_EQUAL(rows.count, size_t{24});
+    CHECK_EQUAL(rows.state_dim, size_t{4});
+    const std::vector<float> first(rows.observation(12), rows.observation(12) + 4);
+    CHECK(first == (std::vector<float>{3.3f + 0.59408427f, 3.3f - 1.27567528f, 0, 0}));
+    CHECK(rows.actions[24] == 0.23264489f && rows.actions[25] == 0.23077023f);
+    CHECK(std::ranges::all_of(rows.rewards, [](float reward) { return reward == 0; }));
+    CHECK_EQUAL(file.find("episode_0/rewards")->type, "int64");
+    CHECK(rows.timeouts[11] == 1 && rows.timeouts[23] == 1 && std::ranges::count(rows.timeouts, 1) == 2);
+    CHECK(rows_outside(rows, task).empty());
+    const std::vector<std::string> remarks = remarks_on(rows, task, "d4rl");
+    CHECK_EQUAL(remarks.size(), size_t{1});
+    CHECK(some_contain(remarks, "the state is observation") && some_contain(remarks, "0.45"));
+#ifdef WODTEM_MUJOCO
+    MujocoEnvironment environment(task, Physics::d4rl);
+    size_t same = 0;
+    for (size_t row = 0; row < rows.count; ++row) {
+        const float* const s = rows.observation(row);
+        environment.start(std::vector<double>{s[0], s[1]}, std::vector<double>{s[2], s[3]});
+        environment.advance(std::vector<double>{rows.actions[2 * row], rows.actions[2 * row + 1]});
+        double difference = 0;
+        for (size_t i = 0; i < 4; ++i)
+            difference =
+                std::max(difference, std::fabs(environment.observation[i] - rows.next_observations[4 * row + i]));
+        same += difference < 1e-6;
+    }
+    CHECK(same >= 20);
+#endif
+    CHECK_FAILS("dataset.shape", read_minari(file));
+    CHECK_FAILS("dataset.shape", read_minari(file, find_mujoco_task("hopper")));
+}
+
+#ifdef WODTEM_MUJOCO
+// Gymnasium's Hopper-v5 on MuJoCo 3.4.0 is, but for the reward, that of physics 2.2; our own data are of their physics.
+TEST(recorded_transitions_tell_the_bodies_that_made_them) {
+    const MujocoTask& hopper = *find_mujoco_task("hopper");
+    const Rows rows = read_minari(file_of_minari("hopper"));
+    const auto largest = [&](const Rows& data, Physics physics) {
+        const std::vector<double> differences = transition_differences(data, hopper, physics);
+        CHECK(differences.size() > 20 && std::ranges::is_sorted(differences));
+        return differences.back();
+    };
+    CHECK(largest(rows, Physics::mujoco_2_2) < 1e-5);  // the observations of the file, in float
+    CHECK(largest(rows, Physics::d4rl) > 1e-3);
+    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "choose these with --physics 2.2"));
+    CHECK(remarks_on(rows, hopper, "2.2").empty());
+    Rows own;
+    MujocoEnvironment environment(hopper, Physics::d4rl);
+    own.state_dim = 11;
+    own.action_dim = 3;
+    for (uint64_t episode = 0; own.count < 450; ++episode) {
+        const auto trajectory = random_trajectory(environment, 1, episode);
+        append_all(own.observations, trajectory->states);
+        append_all(own.actions, trajectory->actions);
+        own.count += trajectory->rewards.size();
+        own.terminals.resize(own.count);
+        own.terminals.back() = 1;
+    }
+    CHECK(largest(own, Physics::d4rl) < 1e-4);
+    CHECK(largest(own, Physics::mujoco_2_2) > 1e-3);
+    own.of_minari = true;  // which does not make them Gymnasium's
+    CHECK(remarks_on(own, hopper, "d4rl").empty());
+    CHECK(some_contain(remarks_on(own, hopper, "2.2"), "choose these with --physics d4rl"));
+    own.observations[5] = 10;  // row 0: a velocity at its limit
+    CHECK(transition_differences(own, hopper, Physics::d4rl).size() < 200);
+    own.actions.assign(own.actions.size(), NAN);
+    CHECK(transition_differences(own, hopper, Physics::d4rl).empty());
+}
+#endif
+
+TEST(antmaze_of_minari_has_its_position_in_front) {
+    const MujocoTask& task = *find_mujoco_task("antmaze-umaze-v2");
+    const Rows rows = read_minari(file_of_minari("antmaze"), &task);
+    CHECK_EQUAL(rows.count, size_t{6});
+    CHECK_EQUAL(rows.state_dim, size_t{29});
+    const float* const s = rows.observation(3);
+    CHECK_CLOSE(s[0], -0.3763371, 1e-6);
+    CHECK_CLOSE(s[1], -4.1533471, 1e-6);
+    CHECK(s[2] == 0.75f && s[3] == 1 && s[4] == 0);
+    CHECK_EQUAL(rows.actions[3 * 8 + 7], -0.22215715f);
+    CHECK(std::equal(s + 29, s + 58, &rows.next_observations[3 * 29]));
+    CHECK(some_contain(remarks_on(rows, task, "d4rl"), "the state is achieved_goal and observation"));
+}
+
+TEST(a_folder_of_minari_stands_for_its_file) {
+    const MadeFile made_file;
+    const std::string folder = made_file.folder + "/set";
+    std::filesystem::create_directories(folder + "/data");
+    CHECK_EQUAL(data_set_file(folder), folder);
+    CHECK_EQUAL(data_set_file(folder + "/gone"), folder + "/gone");
+    write_file_atomic(folder + "/data/main_data.hdf5", "x");
+    CHECK_EQUAL(data_set_file(folder), folder + "/data/main_data.hdf5");
+    CHECK_EQUAL(data_set_file(folder + "/data"), folder + "/data/main_data.hdf5");
+    const std::string arrow = made_file.folder + "/arrow";
+    std::filesystem::create_directories(arrow + "/data/0");
+    write_file_atomic(arrow + "/data/0/part-0.arrow", "ARROW1");
+    for (const char* below : {"", "/data", "/data/0"}) CHECK_FAILS("dataset.arrow", data_set_file(arrow + below));
+}
+
+// Cells of umaze's map: (1, 1) is the goal's, (2, 1) a wall; 0.2 lies between observed positions and cells.
+TEST(positions_outside_the_maze_are_said_and_many_are_refused) {
+    const MujocoTask& task = *find_mujoco_task("maze2d-umaze-v1");
+    const MadeFile made_file;
+    const auto with = [&](const std::vector<std::array<float, 2>>& places, size_t rows) {
+        std::vector<float> states;
+        for (size_t row = 0; row < rows; ++row) {
+            const auto [x, y] = row < places.size() ? places[row] : std::array{0.8f, 0.8f};
+            states.insert(states.end(), {x, y, 0, 0});
+        }
+        std::vector<uint8_t> ends(rows);
+        ends.back() = 1;
+        Hdf5Writer out(made_file.path);
+        out.add("observations", {rows, 4}, states);
+        out.add("actions", {rows, 2}, std::vector<float>(2 * rows));
+        out.add("rewards", {rows}, std::vector<float>(rows));
+        out.add("terminals", {rows}, std::vector<uint8_t>(rows));
+        out.add("timeouts", {rows}, ends);
+        out.close();
+        return rows_outside(read_data_set(open_hdf5(made_file.path)), task).size();
+    };
+    CHECK_EQUAL(with({{0.31f, 0.31f}, {1.29f, 0.31f}, {1.29f, 1.29f}, {0.31f, 3.29f}}, 9), size_t{0});
+    CHECK_EQUAL(with({{1.31f, 0.8f}, {0.29f, 0.8f}, {-1, -1}, {0.8f, 9}, {1e30f, 0.8f}, {0.8f, NAN}, {4, 4}}, 9),
+                size_t{7});
+    CHECK_EQUAL(with({{-1, -1}}, 100), size_t{1});
+    CHECK_EQUAL(load_data_set(made_file.path, task).size(), size_t{1});
+    CHECK_EQUAL(with({{-1, -1}}, 99), size_t{1});
+    try {
+        load_data_set(made_file.path, task);
+        CHECK(!"loaded");
+    } catch (const Error& error) {
+        CHECK_EQUAL(error.id, "dataset.place");
+        CHECK(std::string(error.what()).find("1 of 99 positions lie in no free cell of maze2d-umaze, first in row 0") !=
+              std::string::npos);
+    }
+}
+
+TEST(data_of_other_bodies_are_named_before_training) {
+    const MujocoTask &hopper = *find_mujoco_task("hopper"), &ant = *find_mujoco_task("ant");
+    Rows rows;  // none, so that no step tells
+    rows.state_dim = 11;
+    CHECK(remarks_on(rows, hopper, "d4rl").empty());
+    rows.of_minari = true;
+    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "if Gymnasium made the data"));
+    CHECK(remarks_on(rows, hopper, "2.2").empty());
+    CHECK(remarks_on(rows, *find_mujoco_task("antmaze-umaze-v2"), "d4rl").empty());
+    rows.of_minari = false;
+    rows.state_dim = 111;
+    rows.observations.assign(222, 0);
+    rows.observations[111 + 26] = 1;  // the last velocity
+    CHECK(remarks_on(rows, ant, "d4rl").empty());
+    rows.observations[111 + 27] = 1e-3f;
+    CHECK(some_contain(remarks_on(rows, ant, "2.2"), "contact forces"));
 }
 
 TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
@@ -172,7 +346,7 @@ TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
             CHECK(!"read");
         } catch (const Error& error) {
             CHECK_EQUAL(error.id, "dataset.column");
-            CHECK(std::string(error.what()).find("\"" + std::string(name) + "\" has a row for each") !=
+            CHECK(std::string(error.what()).find("\"" + std::string(name) + "\": has a row for each") !=
                   std::string::npos);
         }
     }
@@ -206,21 +380,23 @@ TEST(cut_by_episodes_maze_data_end_at_the_time_limit_alone) {
     std::vector<uint8_t> timeouts(700), terminals(700);
     timeouts[99] = timeouts[449] = 1;
     Hdf5Writer out(made_file.path);
-    out.add("observations", {700, 4}, std::vector<float>(2800));
+    out.add("observations", {700, 4}, std::vector<float>(2800, 1));  // in the goal's cell
     out.add("actions", {700, 2}, std::vector<float>(1400));
     out.add("rewards", {700}, std::vector<float>(700));
     out.add("terminals", {700}, terminals);
     out.add("timeouts", {700}, timeouts);
     out.close();
-    const auto lengths = [&](bool use_timeouts) {
+    const auto lengths = [&](const char* rule) {
+        Settings settings;
+        settings.cut = rule;
         std::vector<int> all;
         for (const Trajectory& trajectory :
-             load_data_set(made_file.path, *find_mujoco_task("maze2d-umaze-v1"), use_timeouts))
+             load_data_set(made_file.path, *find_mujoco_task("maze2d-umaze-v1"), settings))
             all.push_back(trajectory.length());
         return all;
     };
-    CHECK(lengths(true) == (std::vector<int>{100, 350}));
-    CHECK(lengths(false) == (std::vector<int>{300, 300}));
+    CHECK(lengths("flags") == (std::vector<int>{100, 350}));
+    CHECK(lengths("episodes") == (std::vector<int>{300, 300}));
 }
 
 // Rows 2 and 6 (timeouts) and 7 (the last) are no tuples; 1 does not lead to 3, 4 ends by itself, 5 is the last tuple.
@@ -291,7 +467,13 @@ TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
     rows.actions[0] = -1.001f;
     CHECK_EQUAL(said(rows),
                 "dataset.action f: \"actions\", row 0, column 0 is -1.001; actions lie in [-1, 1]: is it of another "
-                "task, or not scaled?");
+                "task, or not scaled? Where they are commands that a machine cut off, --clip-actions does the same");
+    clip_actions(rows, "f");
+    CHECK_EQUAL(said(rows), "");
+    CHECK_EQUAL(rows.actions[0], -1.0f);
+    rows.actions[0] = INFINITY;  // is no command
+    clip_actions(rows, "f");
+    CHECK(said(rows).starts_with("dataset.not_finite"));
     rows.actions[0] = NAN;
     CHECK_EQUAL(said(rows),
                 "dataset.not_finite f: \"actions\", row 0, column 0 is nan; only finite numbers can be learned from");
@@ -304,6 +486,21 @@ TEST(rows_of_another_size_or_without_an_end_are_refused) {
     tiny.state_dim = tiny.action_dim = 1;
     CHECK_FAILS("dataset.empty", cut_trajectories(made({1, 2}, {0, 0}, {}), tiny, "f"));
     CHECK_EQUAL(cut_trajectories(made({1, 2}, {0, 1}, {}), tiny, "f").size(), size_t{1});
+}
+
+// The setting came later: a file of before does not have it, and one of after only where it is yes.
+TEST(clipping_of_actions_is_a_setting_that_only_its_users_files_have) {
+    Settings settings = default_settings("hopper-medium-v2", "wodtem", "small");
+    const std::string text = settings_text(settings);
+    CHECK(text.find("clip_actions") == std::string::npos && !settings_from_text(text, "f").clip_actions);
+    set_from(settings, "clip_actions", "yes", "command line");
+    CHECK(settings_text(settings).find("clip_actions = yes ") != std::string::npos);
+    CHECK(settings_from_text(settings_text(settings), "f").clip_actions);
+    CHECK(train_command(settings).ends_with(" --set clip_actions=yes"));
+    CHECK_FAILS("run.other_settings", require_same_settings(settings_from_text(text, "f"), settings, "g"));
+    Settings grid = default_settings("gridworld", "wodtem", "small");
+    grid.clip_actions = true;
+    CHECK_FAILS("usage.setting", check_together(grid));
 }
 
 TEST(a_data_set_is_looked_for_in_d4rls_folder_and_then_in_ours) {

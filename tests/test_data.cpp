@@ -87,6 +87,33 @@ TEST(safetensors_written_by_hand_is_read) {
     CHECK(parse(raw_file("{}", "")).tensors.empty());
 }
 
+// Bytes from safetensors 0.8.0 with NumPy and ml_dtypes: 1, -2.5, 65504, 2^-24, the greatest subnormal, inf; the same
+// but for 3.3895314e38 and 2^-133 as bfloat16; 0.1 and 1e-300 as F64, of which the second becomes 0.
+TEST(safetensors_of_16_and_64_bits_are_converted_to_float) {
+    const std::string halves("\x00\x3c\x00\xc1\xff\x7b\x01\x00\xff\x03\x00\x7c", 12);
+    const std::string bfloats("\x80\x3f\x20\xc0\x7f\x7f\x01\x00\xc0\xff\x80\xff", 12);
+    const double doubles[] = {0.1, 1e-300, -3e38, NAN};
+    const std::string header = "{\"h\":" + entry("F16", "[2,3]", "[0,12]") +
+                               ",\"b\":" + entry("BF16", "[6]", "[12,24]") +
+                               ",\"d\":" + entry("F64", "[4]", "[24,56]") + ",\"e\":" + entry("F16", "[0]", "[56,56]") +
+                               ",\"u\":" + entry("U8", "[1]", "[56,57]") + "}";
+    std::string data = halves + bfloats + std::string(reinterpret_cast<const char*>(doubles), 32) + "x";
+    const TensorFile file = parse(raw_file(header, data));
+    CHECK(file.get_floats("h", {2, 3}) == (std::vector<float>{1, -2.5f, 65504, 0x1p-24f, 1023 * 0x1p-24f, INFINITY}));
+    const std::vector<float> b = file.get_floats("b", {6}), d = file.get_floats("d", {4});
+    CHECK(b[0] == 1 && b[1] == -2.5f && b[2] == 0x1.fep127f && b[3] == 0x1p-133f && std::isnan(b[4]) &&
+          b[5] == -INFINITY);
+    CHECK(d[0] == 0.1f && d[1] == 0 && d[2] == -3e38f && std::isnan(d[3]));
+    CHECK_FAILS("safetensors.dtype", file.get_floats("u", {1}));
+    CHECK_FAILS("safetensors.dtype", file.get<float>("h", {2, 3}));  // where no conversion is wanted
+    CHECK_FAILS("safetensors.shape", file.get_floats("b", {3, 2}));
+    CHECK_FAILS("safetensors.missing", file.get_floats("x", {}));
+    data.replace(24, 8, std::string("\0\0\0\xe0\xff\xff\xef\x47", 8));  // FLT_MAX
+    CHECK_EQUAL(parse(raw_file(header, data)).get_floats("d", {4})[0], 0x1.fffffep127f);
+    data.replace(24, 8, std::string("\0\0\0\xf0\xff\xff\xef\x47", 8));  // half a step above: rounds to infinity
+    CHECK_FAILS("safetensors.range", parse(raw_file(header, data)).get_floats("d", {4}));
+}
+
 TEST(safetensors_round_trip_gives_the_same_bytes) {
     const TensorFile file = small_file();
     const std::string bytes = serialise_safetensors(file);
@@ -246,7 +273,7 @@ TEST(safetensors_names_each_way_a_header_can_be_wrong) {
         {"safetensors.duplicate_name", "{\"__metadata__\":{\"k\":\"1\",\"\\u006b\":\"2\"}," + a + "}"},
         {"safetensors.duplicate_name", "{\"a\":{\"dtype\":\"U8\",\"dtype\":\"U8\"}}"},
         {"safetensors.name", "{\"a\\u001b\":" + entry("U8", "[4]", "[0,4]") + "}"},
-        {"safetensors.dtype", "{\"a\":" + entry("F16", "[2]", "[0,4]") + "}"},
+        {"safetensors.dtype", "{\"a\":" + entry("F8_E4M3", "[4]", "[0,4]") + "}"},
         {"safetensors.shape", "{\"a\":" + entry("U8", "[3]", "[0,4]") + "}"},
         {"safetensors.shape", "{\"a\":" + entry("F32", "[4]", "[0,4]") + "}"},
         {"safetensors.shape", "{\"a\":" + entry("F32", "[4611686018427387905]", "[0,4]") + "}"},  // 2^62 + 1, times 4

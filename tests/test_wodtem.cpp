@@ -1054,7 +1054,7 @@ TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
     check_shell(eval + " --seed 5 --episodes 3 --set g_eval=0.5 --set eval_context=1", 0, "seed 5: mean length");
     check_shell(eval + " --episodes 3", 0, "over 3 episodes");
     check_shell(eval + " --episodes 3 --record " + scratch / "made.hdf5", 0, "over 3 episodes");
-    const Rows rows = read_data_set(scratch / "made.hdf5");
+    const Rows rows = read_data_set(open_hdf5(scratch / "made.hdf5"));
     CHECK_EQUAL(number_text(rows.count), number_text(3 * static_cast<int>(*to_number(last_row()[12]))));  // three alike
     CHECK(rows.state_dim == 2 && rows.action_dim == 1 && rows.ends(rows.count - 1) && rows.ends(rows.count / 3 - 1));
     CHECK_EQUAL(std::count(rows.terminals.begin(), rows.terminals.end(), 1) +
@@ -1261,7 +1261,7 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     set_setting(settings, "context_length", "4");
     quiet_train(settings, scratch / "run");
     check_shell("./wodtem eval " + scratch / "run --episodes 2 --record " + scratch / "made.hdf5", 0, "2 episodes");
-    const Rows rows = read_data_set(scratch / "made.hdf5");
+    const Rows rows = read_data_set(open_hdf5(scratch / "made.hdf5"));
     std::string states, expected;
     float wanted = 1;  // g_eval, less each reward
     for (size_t row = 0; row < rows.count; ++row) {
@@ -1977,7 +1977,7 @@ TEST(bad_models_are_refused_with_file_tensor_and_offset) {
     refuses(spoilt("\"data_offsets\":[32,64]", "\"data_offsets\":[64,32]"), "safetensors.offsets",
             "\"embed_return.bias\"");
     refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"I64\",\"shape\":[8]"), "safetensors.dtype", "\"embed_state.weight\"");
-    refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"BF16\",\"shape\":[8,4]"), "safetensors.dtype", "\"BF16\"");
+    refuses(spoilt("\"F32\",\"shape\":[8,2]", "\"F8_E5M2\",\"shape\":[8,8]"), "safetensors.dtype", "\"F8_E5M2\"");
     refuses(spoilt("[8,2]", "[2,8]"), "safetensors.shape", "\"embed_state.weight\" has shape [2, 8], expected [8, 2]");
     refuses(spoilt("[8,2]", "[8,3]"), "safetensors.shape", "\"embed_state.weight\"");
     refuses(spoilt("\"shape\":[24]", "\"shape\":[18446744073709551615,2]"), "safetensors.shape", "c_attn.bias");
@@ -2047,6 +2047,26 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
     check_shell("./wodtem import " + scratch / "full.safetensors" + " " + back + set, 0, "gridworld, wodtem");
     other.load(back);
     CHECK_EQUAL(other.run.agent.normaliser.deviation[1], 4.0f);
+    for (const float bad : {NAN, INFINITY, -INFINITY}) {  // statistics that are no numbers, as tensors and as text
+        TensorFile spoilt = plain;
+        spoilt.add("state_mean", {2}, std::array{1.0f, bad});
+        spoilt.add("state_std", {2}, std::array{3.0f, 4.0f});
+        write_safetensors(scratch / "spoilt.safetensors", spoilt);
+        check_shell("./wodtem import " + scratch / "spoilt.safetensors" + " " + back + set, 1,
+                    "tensor state_mean holds a number that is not finite");
+        spoilt = plain;
+        spoilt.metadata = {{"state_mean", "1 2"}, {"state_std", "3 " + number_text(bad)}};
+        write_safetensors(scratch / "spoilt.safetensors", spoilt);
+        check_shell("./wodtem import " + scratch / "spoilt.safetensors" + " " + back + set, 1,
+                    "metadata entry state_std is not 2 finite numbers");
+    }
+    TensorFile twice;  // the same network in F64
+    for (const StoredTensor& tensor : full.tensors) twice.add(tensor.name, tensor.shape, full.numbers(tensor));
+    write_safetensors(scratch / "twice.safetensors", twice);
+    const std::string before = read_file(back);
+    check_shell("./wodtem import " + scratch / "twice.safetensors" + " " + back + set, 0, "gridworld, wodtem");
+    CHECK(read_file(back) == before);
+    check_shell("./wodtem info " + scratch / "twice.safetensors", 0, "F64 [8, 2]");
     check_shell("./wodtem import " + odt + " " + back + set + " --set layers=2", 1, "\"transformer.h.1.ln_1.weight\"");
     check_shell("./wodtem import " + odt + " " + back + set + " --set width=16", 1,
                 "\"embed_return.weight\" has shape [8, 1]");
@@ -2282,6 +2302,7 @@ TEST(trace_answers_line_by_line_and_refuses_what_it_cannot_read) {
     CHECK_EQUAL(row.size(), size_t{6});
     const double expected[6] = {3 + 0.01 * vx, 0.9 + 0.01 * vy, vx, vy, 0, 0};
     for (size_t i = 0; i < row.size(); ++i) CHECK_CLOSE(row[i], expected[i], 1e-12);
+    CHECK_EQUAL(trace_of("maze2d-large", "init qpos,3,0.9\r\ninit qvel,0,6\r\n2,0\r\n"), text);  // as on Windows
     CHECK_EQUAL(trace_of("maze2d-umaze", start + "0,0\n" + start + "0,0\n"),
                 trace_of("maze2d-umaze", start + "0,0\n") + trace_of("maze2d-umaze", start + "0,0\n"));
     CHECK(trace_of("maze2d-umaze", "goal,0.5,0.5\n" + start + "0,0\n").ends_with(",1,0\n"));

@@ -77,6 +77,7 @@ inline void trace(MujocoEnvironment& environment, std::istream& input) {
     TraceLine line{0, ""};
     while (std::getline(input, line.text)) {
         ++line.number;
+        if (line.text.ends_with('\r')) line.text.pop_back();  // Windows ends lines so
         if (line.text.starts_with("goal")) {
             if (!environment.task->maze) line.refuse("no goal: " + std::string(environment.task->name) + " is no maze");
             const std::vector<double> goal = line.numbers("goal,", 2, a_goal);

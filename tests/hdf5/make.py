@@ -8,7 +8,7 @@ Each NAME.z is an HDF5 file: its size (8 bytes, least significant first), then t
 follow v(i) = 37 i mod 251, i the number of the element, row-major: float v / 128, signed v - 125, unsigned v, bool
 v mod 2; where something else is stored, test_hdf5.cpp says what.
 """
-import ctypes, glob, os, pathlib, struct, sys, tempfile, zlib
+import ctypes, glob, os, pathlib, struct, subprocess, sys, tempfile, zlib
 import h5py
 import numpy as np
 
@@ -24,6 +24,11 @@ def values(shape, dtype):
     return np.reshape(v, shape).astype(dtype)
 
 
+def pack(name, data):
+    (here / (name + suffix + ".z")).write_bytes(struct.pack("<Q", len(data)) + zlib.compress(data, 9))
+    print(name + suffix, len(data), (here / (name + suffix + ".z")).stat().st_size)
+
+
 def make(name, fill_in, istore_k=None, **options):
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "f")
@@ -35,9 +40,7 @@ def make(name, fill_in, istore_k=None, **options):
             h5py.h5f.create(path.encode(), h5py.h5f.ACC_TRUNC, fcpl, fapl).close()
         with h5py.File(path, "r+" if istore_k else "w", **options) as f:
             fill_in(f)
-        data = open(path, "rb").read()
-    (here / (name + suffix + ".z")).write_bytes(struct.pack("<Q", len(data)) + zlib.compress(data, 9))
-    print(name + suffix, len(data), (here / (name + suffix + ".z")).stat().st_size)
+        pack(name, open(path, "rb").read())
 
 
 def put(g, name, shape, dtype, **options):
@@ -237,6 +240,73 @@ def root(f):  # attributes of the root group, of which single numbers are read; 
         f[path] = h5py.SoftLink(to)
 
 
+def peers(f):  # what other programs' files have beside the plain things
+    put(f, "lzf/float", (300, 3), "f4", compression="lzf", chunks=(100, 3))
+    put(f, "lzf/shuffled", (300, 3), "f8", compression="lzf", shuffle=True, fletcher32=True, chunks=(128, 2))
+    f.create_dataset("lzf/zeros", data=np.zeros(5000, "i4"), compression="lzf")
+    put(f, "lzf/kept", (3,), "u1", compression="lzf")  # grows, so the filter is skipped
+    half = np.array([0, 1, -2, 0.333, 65504, 6.1e-5, 5.96e-8, 1.2e-6, np.inf, -np.inf, np.nan, -0.0], "f2")
+    f["half/little"] = half
+    f["half/big"] = half.astype(">f2")
+    f["line\nbreak"] = np.zeros(2, "f4")
+    g = f["lzf"]
+    for i in range(40):
+        g = g.create_group("deeper%d" % i)
+    put(g, "deep", (2,), "f4")
+    for i in range(15):
+        g = g.create_group("below%d" % i * 50)  # to paths of 5,000 bytes
+    put(g, "out_of_reach", (2,), "f4")
+    f["a/b/c/first"] = f["half"]  # hard links: to a group that a shorter path leads to, to the parent, to itself
+    f["a/parent"] = f["/"]
+    f["a/b/self"] = f["a/b"]
+    f["also_a"] = f["a"]
+    f.create_virtual_dataset("refused/virtual", h5py.VirtualLayout((4,), "f4"))
+    put(f, "refused/scale_offset", (64,), "i4", scaleoffset=0, chunks=(64,))
+    low_level(f["refused"], "n_bit", (8,), "i4", chunks=(8,), change=lambda p: p.set_filter(h5py.h5z.FILTER_NBIT, 0))
+    f["type"] = np.dtype("f4")
+    f.create_dataset("refused/committed", data=values((3,), "f4"), dtype=f["type"])
+
+
+def tables():  # PyTables 3.11.1: bools as bit fields of a byte, and Blosc
+    import tables as pytables
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "f")
+        with pytables.open_file(path, "w") as f:
+            f.create_array("/", "flags", values((40,), "?"))
+            f.create_carray("/", "zipped", obj=values((40,), "?"), filters=pytables.Filters(5, "zlib"))
+            f.create_carray("/", "blosc", obj=values((400,), "f4"), filters=pytables.Filters(5, "blosc"))
+        pack("tables", open(path, "rb").read())
+
+
+def shared():  # h5repack -s 1 (HDF5 1.10.8): a header's messages lie in a heap that objects share
+    with tempfile.TemporaryDirectory() as folder:
+        old, new = os.path.join(folder, "f"), os.path.join(folder, "g")
+        with h5py.File(old, "w") as f:
+            put(f, "actions", (5, 2), "f4")
+            put(f, "observations", (5, 2), "f4")
+        subprocess.run(["h5repack", "-s", "1", old, new], check=True)
+        pack("shared", open(new, "rb").read())
+
+
+def minaris():  # Minari 0.5.4, Gymnasium-Robotics 1.4.2, MuJoCo 3.4.0: two short episodes each, of random actions
+    import gymnasium, gymnasium_robotics, minari as library_of_minari
+    gymnasium.register_envs(gymnasium_robotics)
+
+    class Whole(gymnasium.RewardWrapper):
+        def reward(self, reward):
+            return int(reward)  # stored as int64
+    for name, id, steps in [("pointmaze", "PointMaze_Medium-v3", 12), ("antmaze", "AntMaze_UMaze-v4", 3), ("hopper", "Hopper-v5", 15)]:
+        env = gymnasium.make(id, max_episode_steps=steps)
+        env = library_of_minari.DataCollector(env if name == "hopper" else Whole(env), record_infos=False)
+        rng = np.random.default_rng(0)
+        for episode in range(2):
+            env.reset(seed=episode)
+            for _ in range(steps):
+                env.step(rng.uniform(-1, 1, env.action_space.shape).astype("f4"))
+        made = env.create_dataset(dataset_id=name + "/x-v0", algorithm_name="a", author="b", author_email="c", code_permalink="d")
+        pack(name, (pathlib.Path(made.storage.data_path) / "main_data.hdf5").read_bytes())
+
+
 def skewed():  # no HDF5: 4180 bytes, byte k Fibonacci(k + 1) times, so that codes have up to 15 bits
     a, b, text = 1, 1, b""
     for k in range(17):
@@ -273,6 +343,11 @@ if suffix == "":
     make("superblock1", short, istore_k=16)
     make("superblock2", short, libver=("v108", "v108"))
     make("userblock", short, userblock_size=1024)
+    make("peers_old", peers)
+    make("peers_latest", peers, libver="latest")
+    tables()
+    shared()
+    minaris()
     skewed()
 else:
     make("latest", everything, libver="latest")
