@@ -12,8 +12,8 @@
 // Training on a file.
 
 // Means over the steps of the trajectories; NaN where there are none. log_prob: log pi(a_t | s, g) with the
-// returns-to-go that the trajectory had, for DT minus its loss. error: the share of moves that are not the policy's most
-// likely one; for continuous actions the squared error of the policy's mean, averaged over the dimensions.
+// returns-to-go that the trajectory had, for DT minus its loss. error: the share of moves that are not the policy's
+// most likely one; for continuous actions the squared error of the policy's mean, averaged over the dimensions.
 struct HeldOut {
     double log_prob = NAN, error = NAN;
 };

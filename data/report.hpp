@@ -510,8 +510,8 @@ inline void name_differences(Group& group) {
     }
 }
 
-// Adds a chart, if there is something to draw. Below its title stand the conditions, how many seeds its series are from,
-// and what `spread` shows of them; file: the end of its name.
+// Adds a chart, if there is something to draw. Below its title stand the conditions, how many seeds its series are
+// from, and what `spread` shows of them; file: the end of its name.
 inline void add_chart(std::vector<Part>& parts, const Group& group, svg::Chart chart, const std::string& spread,
                       const std::string& caption, const std::string& file) {
     std::set<size_t> seeds;
@@ -826,8 +826,8 @@ inline void add_grid_world(std::vector<Part>& parts, const Group& group) {
     parts.emplace_back(
         "Lengths are in steps. Shortest met: the shortest online episode that reached the goal. At 5 from: the online "
         "interactions of the first evaluation from which on every one took 5 steps, the length of the shortest path "
-        "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps. Compare "
-        "the first figure with figs. 1b and 4a of the paper.");
+        "(0: from the end of offline training on; \"-\": none). An episode ends at the goal or after 100 steps. "
+        "Compare the first figure with figs. 1b and 4a of the paper.");
     add_curves(parts, group, [](auto column) { return column == "eval_length"; });
     for (const Row& row : group.rows) add_start_actions(parts, group, row);
     add_histogram(parts, group);
@@ -863,8 +863,8 @@ inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
 // Own data: the curves of what is held out follow with those of training.
 inline void add_own_data(std::vector<Part>& parts, const Group&) {
     parts.emplace_back(
-        "There is no environment: nothing is evaluated by acting. On the trajectories that are held out, how likely the "
-        "policy finds their actions, and how far its own are from them.");
+        "There is no environment: nothing is evaluated by acting. On the trajectories that are held out, how likely "
+        "the policy finds their actions, and how far its own are from them.");
 }
 
 // "Updates made, mean over seeds: ODT 42,000; WODTEM 143,000, 3.4 times those of ODT." and what follows from it.

@@ -13,8 +13,8 @@
 //   budgets                  the smaller budgets of a run that went on, a line each
 //
 // Promises: the checkpoint notes the length and the checksum of progress.csv and episodes.csv, and continuing cuts them
-// back to it, so an interrupted run ends with the same bytes, but for seconds.csv; a folder of other settings is left as
-// it is; one process at a time works in a folder. Leaves out: what the state of a run is (the caller visits it).
+// back to it, so an interrupted run ends with the same bytes, but for seconds.csv; a folder of other settings is left
+// as it is; one process at a time works in a folder. Leaves out: what the state of a run is (the caller visits it).
 #pragma once
 
 #include <sys/file.h>
