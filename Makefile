@@ -8,6 +8,7 @@
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
 #   make map              the map from the paper's equations to code, tests and vectors
 #   make mutants          which of some 200 one-line mistakes the golden vectors and the tests find; about 15 minutes
+#   make faults           every call of the system and every allocation of eight commands made to fail; FAST=1: a few
 #   make bench            the machine's peak, each kernel's share of it, update and look-up times
 #   make format           lay out the sources with clang-format
 #   make clean            remove what was built (runs/ stays)
@@ -84,6 +85,9 @@ map:
 mutants: | packages
 	@sh tests/mutants.sh
 
+faults: wodtem
+	@sh tests/faults.sh
+
 bench: wodtem
 	./wodtem bench
 
@@ -93,4 +97,4 @@ format:
 clean:
 	rm -rf build wodtem
 
-.PHONY: packages run paper-gridworld test sanitize map mutants bench format clean
+.PHONY: packages run paper-gridworld test sanitize map mutants faults bench format clean
