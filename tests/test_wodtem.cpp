@@ -2105,7 +2105,8 @@ TEST(inputs_of_the_fuzz_targets_end_in_a_value_or_an_error) {
         for (uint32_t change = 0; change <= 30; ++change) {
             std::string bytes = whole;  // the first time as it is
             const auto at = static_cast<size_t>(random.uniform(i, change) * static_cast<double>(bytes.size()));
-            if (change > 0 && !bytes.empty()) bytes[at] = static_cast<char>(random.uniform(i, change + 100) * 256);
+            if (change > 0 && !bytes.empty())
+                bytes[at] = static_cast<char>(static_cast<int>(random.uniform(i, change + 100) * 256));
             std::string id;
             try {
                 quietly([&] { fuzz::run_target(target, bytes); });
