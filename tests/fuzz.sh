@@ -100,7 +100,7 @@ for target; do
     finding=
     if [ $status != 0 ]; then
         found=$((found + 1))
-        finding=$(grep -a -m 1 -e '^SUMMARY' -e 'what()' log-$target; grep -a -o 'found/.*' log-$target | tail -n 1)
+        finding=$(grep -a -m 1 -e '^SUMMARY' -e 'what()' log-$target; grep -a -o 'written to .*' log-$target | tail -n 1)
     fi
     executions=$(sed -n 's/^stat::number_of_executed_units: *//p' log-$target)
     edges=$(echo "$line" | sed 's/.*cov: \([0-9]*\).*/\1/') inputs=$(echo "$line" | sed 's/.*corp: \([0-9]*\).*/\1/')
