@@ -2,7 +2,7 @@
 // and as functions that a test calls on what is stored in tests/fuzz/ (tests/test_wodtem.cpp).
 //
 // run_target(target, input) may return or throw Error. Anything else is a finding: another exception, a signal, a
-// sanitizer's report, seconds of work, memory out of proportion, or a promise that does not hold (require_same).
+// sanitizer's report, a second of work, memory out of proportion, or a promise that does not hold (require_same).
 #ifndef WODTEM_NO_MAIN
 #define WODTEM_NO_MAIN
 #include "../wodtem.cpp"

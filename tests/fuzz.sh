@@ -93,7 +93,7 @@ printf '%-14s %10s %8s %8s   %s\n' target executions edges inputs finding
 for target; do
     mkdir -p corpus/$target
     status=0
-    FUZZ_TARGET=$target "$fuzz" corpus/$target seeds/$target -dict=words -max_total_time="$seconds" -timeout=5 \
+    FUZZ_TARGET=$target "$fuzz" corpus/$target seeds/$target -dict=words -max_total_time="$seconds" -timeout=1 \
         -malloc_limit_mb=256 -rss_limit_mb=1024 -print_final_stats=1 -artifact_prefix=found/$target- \
         > log-$target 2>&1 || status=$?
     line=$(grep -a 'cov: ' log-$target | tail -n 1)
