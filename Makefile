@@ -8,6 +8,10 @@
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
 #   make map              the map from the paper's equations to code, tests and vectors
 #   make mutants          which of some 200 one-line mistakes the golden vectors and the tests find; about 15 minutes
+#   make faults           every call of the system and every allocation of eight commands made to fail; FAST=1: a few
+#   make fuzz             inputs made by libFuzzer for everything that is read, SECONDS=20 for each target; needs clang 19
+#   make endure           runs killed KILLS=500 times and continued, by 1 to 8 threads, and watched for growth
+#   make coverage         lines and branches that the tests reach; needs clang 19
 #   make bench            the machine's peak, each kernel's share of it, update and look-up times
 #   make format           lay out the sources with clang-format
 #   make clean            remove what was built (runs/ stays)
@@ -21,10 +25,10 @@ CXX = g++
 CXXFLAGS = -std=c++20 -O2 -fvect-cost-model=dynamic -fpeel-loops -funswitch-loops -pthread \
            -ffp-contract=off -fno-math-errno \
            -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wno-restrict -Werror
-HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml data/policies/* tests/*.hpp)
+HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml data/policies/* tests/*.hpp tests/fuzz.cpp)
 # Asked when it is needed, after `packages`.
 LIBRARIES = $(shell $(CXX) -E -x c++ -include mujoco/mujoco.h /dev/null >/dev/null 2>&1 && echo -lmujoco)
-TESTS = $(patsubst tests/%.cpp,%,$(wildcard tests/*.cpp))
+TESTS = $(patsubst tests/%.cpp,%,tests/main.cpp $(wildcard tests/test_*.cpp))
 SOURCES = $(wildcard *.hpp *.cpp data/*.hpp tests/*.hpp tests/*.cpp)
 
 wodtem: wodtem.cpp $(HEADERS) | packages
@@ -84,6 +88,40 @@ map:
 mutants: | packages
 	@sh tests/mutants.sh
 
+faults: wodtem
+	@sh tests/faults.sh
+
+# clang 19 of Debian 12: libFuzzer, and branches counted by the conditions of the source.
+CLANG = clang++-19
+CLANGFLAGS = -std=c++20 -O1 -g1 -w -pthread -ffp-contract=off -fno-math-errno
+clang: | packages
+	@$(INSTALL); command -v $(CLANG) >/dev/null || install clang-19
+	@$(INSTALL); command -v llvm-cov-19 >/dev/null || install llvm-19
+
+build/fuzz/fuzz: tests/fuzz.sh wodtem.cpp $(HEADERS) | clang
+	sh tests/fuzz.sh build $(CLANG) $(CLANGFLAGS) $(LIBRARIES)
+
+SECONDS = 20
+fuzz: wodtem build/fuzz/fuzz
+	@sh tests/fuzz.sh run $(SECONDS) $(TARGETS)
+
+endure: wodtem
+	@sh tests/endure.sh
+
+build/coverage-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | clang
+	@mkdir -p build
+	$(CLANG) $(CLANGFLAGS) -fprofile-instr-generate -fcoverage-mapping -c $< -o $@
+
+build/tests-coverage: $(TESTS:%=build/coverage-%.o)
+	$(CLANG) -pthread -fprofile-instr-generate $^ -o $@ $(LIBRARIES)
+
+# What the program does as a process of its own, started by a test, is not counted.
+coverage: wodtem build/tests-coverage
+	LLVM_PROFILE_FILE=build/coverage.profraw build/tests-coverage | tail -n 1
+	@llvm-profdata-19 merge build/coverage.profraw -o build/coverage.profdata
+	@llvm-cov-19 report build/tests-coverage -instr-profile=build/coverage.profdata -show-region-summary=false \
+	  *.hpp wodtem.cpp data/*.hpp
+
 bench: wodtem
 	./wodtem bench
 
@@ -93,4 +131,4 @@ format:
 clean:
 	rm -rf build wodtem
 
-.PHONY: packages run paper-gridworld test sanitize map mutants bench format clean
+.PHONY: packages run paper-gridworld test sanitize map mutants faults clang fuzz endure coverage bench format clean

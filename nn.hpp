@@ -173,6 +173,9 @@ class Threads {
         } catch (const std::system_error& error) {
             stop();
             fail("nn.threads", "cannot start %d threads: %s; use fewer", count, error.what());
+        } catch (...) {  // no memory for one: those that have started must end before they are destroyed
+            stop();
+            throw;
         }
     }
     ~Threads() { stop(); }

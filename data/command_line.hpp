@@ -189,11 +189,11 @@ inline int run_command_line(std::span<const Command> commands, const std::vector
 }
 
 // The body of main(): every error becomes a sentence on stderr and an exit status.
-inline int run_program(std::span<const Command> commands, const std::vector<std::string>& words) {
+inline int run_program(std::span<const Command> commands, std::span<const char* const> words) {
     std::signal(SIGPIPE, SIG_IGN);  // write() then returns an error, which becomes a sentence
     std::signal(SIGXFSZ, SIG_IGN);  // the same for a limit on file sizes
     try {
-        return run_command_line(commands, words);
+        return run_command_line(commands, {words.begin(), words.end()});
     } catch (const std::bad_alloc&) {
         std::fprintf(stderr, "wodtem: out of memory\n");
         return 1;

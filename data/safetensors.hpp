@@ -6,6 +6,7 @@
 // machines.
 #pragma once
 
+#include <dirent.h>
 #include <fcntl.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -28,6 +29,7 @@ static_assert(sizeof(size_t) == 8, "sizes in bytes are size_t");
 // Returns the parts, one after the other: texts, whole numbers, and other numbers to six digits.
 std::string text_of(const auto&... parts) {
     std::ostringstream text;
+    text.exceptions(std::ios::badbit);  // or it would swallow the failure of an allocation and leave out the rest
     (text << ... << parts);
     return text.str();
 }
@@ -175,10 +177,16 @@ inline void write_file_atomic(const std::string& path, std::string_view bytes) {
 inline void remove_temporaries(const std::string& folder) {
     std::error_code none;
     std::vector<std::filesystem::path> found;
-    for (const auto& entry : std::filesystem::directory_iterator(folder, none)) {
-        const std::string number = entry.path().stem().extension();  // of NAME.N.tmp: ".N"
+    // Not by a directory_iterator: that of GCC 12 ends the process when an allocation fails.
+    struct Close {
+        void operator()(DIR* open) const { ::closedir(open); }
+    };
+    const std::unique_ptr<DIR, Close> listing(::opendir(folder.c_str()));
+    while (const dirent* entry = listing ? ::readdir(listing.get()) : nullptr) {
+        const std::filesystem::path name = entry->d_name;
+        const std::string number = name.stem().extension();  // of NAME.N.tmp: ".N"
         const bool digits = number.size() > 1 && number.find_first_not_of("0123456789", 1) == std::string::npos;
-        if (digits && entry.path().extension() == ".tmp") found.push_back(entry.path());
+        if (digits && name.extension() == ".tmp") found.push_back(folder / name);
     }
     for (const std::filesystem::path& temporary : found) std::filesystem::remove(temporary, none);
 }

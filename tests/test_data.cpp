@@ -5,13 +5,47 @@
 
 #include <csignal>
 #include <filesystem>
+#include <new>
 #include <set>
 
 #include "../data/figures.hpp"
 #include "../data/safetensors.hpp"
 #include "test.hpp"
 
+// Allocations of this thread until one fails; below 0: none does. The functions are not inlined, or GCC would see a
+// pointer of `new` in free().
+static thread_local long allocations_left = -1;
+
+[[gnu::noinline]] void* operator new(size_t size, const std::nothrow_t&) noexcept {
+    return allocations_left >= 0 && allocations_left-- == 0 ? nullptr : std::malloc(size);
+}
+[[gnu::noinline]] void* operator new(size_t size) {
+    void* const memory = operator new(size, std::nothrow);
+    return memory ? memory : throw std::bad_alloc();
+}
+[[gnu::noinline]] void operator delete(void* memory) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory, size_t) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory, const std::nothrow_t&) noexcept { std::free(memory); }
+
 namespace {
+
+// Calls work() until it makes no further allocation that could fail; each failure must come out as std::bad_alloc.
+// Returns how many there were; after each, and at the end, holds() must be true.
+int fail_each_allocation(const std::function<void()>& work, const std::function<bool()>& holds) {
+    for (int failures = 0;; ++failures) {
+        allocations_left = failures;
+        bool failed = false;
+        try {
+            work();
+        } catch (const std::bad_alloc&) {
+            failed = true;
+        }
+        const bool all_made = allocations_left >= 0;
+        allocations_left = -1;
+        CHECK(failed != all_made && holds());
+        if (all_made || failed_checks() > 0) return failures;
+    }
+}
 
 // A folder of this test program, removed at its end.
 struct Folder {
@@ -321,6 +355,31 @@ TEST(file_is_written_whole_or_not_at_all) {
                 std::filesystem::create_directories(folder / "taken");  // so rename() fails, at the last moment
                 file.commit());
     CHECK(folder.names() == (std::set<std::string>{"model.safetensors", "taken"}));
+}
+
+TEST(an_allocation_that_fails_is_reported_and_leaves_nothing_out) {
+    std::string text;
+    const auto word = std::string(100, 'x');
+    const int in_text = fail_each_allocation([&] { text = text_of(word, 12, word); }, [] { return true; });
+    CHECK(in_text > 1 && text == word + "12" + word);
+
+    const Folder folder;
+    const std::string path = folder / "file", expected = serialise_safetensors(small_file());
+    const auto whole = [&] { return folder.names().empty() || read_file(path) == expected; };
+    CHECK(fail_each_allocation([&] { write_safetensors(path, small_file()); }, whole) > 50);
+    CHECK(folder.names() == std::set<std::string>{"file"});
+
+    const auto lay_down = [&] {
+        for (const char* name : {"/a-name-that-takes-memory.1.tmp", "/another-such-name.2.tmp"})
+            write_file_atomic(folder.path.string() + name, "");
+        return true;
+    };
+    lay_down();
+    CHECK(fail_each_allocation([&] { remove_temporaries(folder.path); }, lay_down) > 5);
+    remove_temporaries(folder.path);
+    CHECK(folder.names() == std::set<std::string>{"file"});
+
+    CHECK(fail_each_allocation([] { Threads threads(4); }, [] { return true; }) > 3);
 }
 
 TEST(writing_follows_links_and_leaves_what_is_no_regular_file) {

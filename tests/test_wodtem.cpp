@@ -8,6 +8,7 @@
 
 #define WODTEM_NO_MAIN
 #include "../wodtem.cpp"
+#include "fuzz.cpp"
 #include "test.hpp"
 
 namespace {
@@ -44,20 +45,14 @@ Settings tiny_settings(const std::string& method, const std::string& alpha = "0.
     return settings;
 }
 
-void quiet_train(
-    const Settings& settings, const std::string& folder, int threads = 1, double checkpoint_every = 1e9,
-    const std::function<bool()>& asked_to_stop = [] { return stop_requested != 0; }, bool keep_state = false) {
+// Calls f() with nothing printed.
+void quietly(const std::function<void()>& f) {
     const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
     std::fflush(stdout);
     dup2(null, 1), dup2(null, 2);
     std::exception_ptr problem;
     try {
-        train(settings, folder,
-              {.kernel = kernel_for(settings.arithmetic),
-               .threads = threads,
-               .checkpoint_every = checkpoint_every,
-               .keep_state = keep_state,
-               .asked_to_stop = asked_to_stop});
+        f();
     } catch (...) {
         problem = std::current_exception();
     }
@@ -65,6 +60,19 @@ void quiet_train(
     dup2(out, 1), dup2(err, 2);
     close(out), close(err), close(null);
     if (problem) std::rethrow_exception(problem);
+}
+
+void quiet_train(
+    const Settings& settings, const std::string& folder, int threads = 1, double checkpoint_every = 1e9,
+    const std::function<bool()>& asked_to_stop = [] { return stop_requested != 0; }, bool keep_state = false) {
+    quietly([&] {
+        train(settings, folder,
+              {.kernel = kernel_for(settings.arithmetic),
+               .threads = threads,
+               .checkpoint_every = checkpoint_every,
+               .keep_state = keep_state,
+               .asked_to_stop = asked_to_stop});
+    });
 }
 
 // Trains until the run asks for the `last`-th time whether to stop: it is told yes, and must say that it stopped. A run
@@ -2328,6 +2336,55 @@ TEST(trace_answers_line_by_line_and_refuses_what_it_cannot_read) {
 }
 
 #endif
+
+// What `make fuzz` has found, and its seeds: each file of tests/fuzz goes to the target that its name begins with. So do
+// files that a run makes, whole and with a byte changed.
+TEST(inputs_of_the_fuzz_targets_end_in_a_value_or_an_error) {
+    std::vector<std::pair<std::string, std::string>> inputs;  // target and bytes
+    for (const auto& entry : fs::directory_iterator("tests/fuzz")) {
+        const std::string name = entry.path().filename();
+        inputs.emplace_back(name.substr(0, name.find('-')), read_file(entry.path()));
+    }
+    CHECK(inputs.size() >= 4);
+    const Scratch scratch;
+    Settings settings = tiny_settings("wodtem");
+    for (const auto& [name, value] : {std::pair("eval_episodes", "2"), {"offline_updates", "2"}})
+        set_setting(settings, name, value);
+    settings.online_steps = 200;
+    uint64_t asked = 0;
+    CHECK_FAILS("run.stopped", quiet_train(settings, scratch / "run", 1, 0, [&] { return ++asked > 40; }));
+    const std::string checkpoint = read_file(scratch / "run/checkpoint.safetensors");
+    quiet_train(settings, scratch / "run");
+    const std::string model = read_file(scratch / "run/model.safetensors");
+    std::string report;
+    for (const char* file : {"settings", "progress.csv", "episodes.csv", "policy.csv", "start_actions.csv"})
+        report += read_file(scratch / ("run/" + std::string(file))) + '\0';
+    for (const char* target : {"safetensors", "model", "import"}) inputs.emplace_back(target, model);
+    inputs.emplace_back("checkpoint", checkpoint);
+    inputs.emplace_back("report", report);
+    inputs.emplace_back("settings", settings_text(settings));
+
+    const Random random{test_seed(), 100};
+    for (size_t i = 0; i < inputs.size(); ++i) {
+        const auto& [target, whole] = inputs[i];
+        for (uint32_t change = 0; change <= 30; ++change) {
+            std::string bytes = whole;  // the first time as it is
+            const auto at = static_cast<size_t>(random.uniform(i, change) * static_cast<double>(bytes.size()));
+            if (change > 0 && !bytes.empty())
+                bytes[at] = static_cast<char>(static_cast<int>(random.uniform(i, change + 100) * 256));
+            std::string id;
+            try {
+                quietly([&] { fuzz::run_target(target, bytes); });
+            } catch (const Error& error) {
+                id = error.id;
+            } catch (const std::exception& other) {
+                report_failure(__FILE__, __LINE__, target + ", change " + std::to_string(change) + ": " + other.what());
+            }
+            if (change == 0) CHECK_EQUAL(id, "");
+        }
+    }
+    fs::remove_all(fuzz::scratch());
+}
 
 // For test_vectors.cpp, which does not include wodtem.cpp.
 int run_command_line(const std::vector<std::string>& words) { return run_command_line(commands, words); }
