@@ -836,7 +836,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     };
     try {
         if (settings.task == own_data)
-            fit_own_data(run, observer);
+            fit_own_data(run, observer, path);
         else if (run.progress.online == 0)
             offline_phase(run, observer);
         if (settings.online_steps > 0) online_phase(run, observer);

@@ -36,7 +36,8 @@ inline const Option option_table[] = {
      "bodies: d4rl (the default), as in MuJoCo up to 2.1.0; 2.2, as that computes them"},
     {"train import sweep check", "--dataset", "FILE", "",
      "HDF5 in D4RL's or Minari's layout, or Minari's folder (default: by the task's name); random: none"},
-    {"train import", "--clip-actions", nullptr, "", "clip the data set's actions to [-1, 1], not refuse those beyond"},
+    {"train import sweep", "--clip-actions", nullptr, "",
+     "clip the data set's actions to [-1, 1], not refuse those beyond"},
     {"train", "--weights", "MODEL", "",
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
@@ -333,17 +334,17 @@ inline void choose_own_data(Settings& settings, const std::string& given) {
     set("action_dim", data.spec.action_dim, "the data set");
     set("moves", data.spec.discrete_actions, "the data set: 0 where actions are continuous");
     set("eta", -data.spec.action_dim, "ODT's code: minus the action dimensions");
-    set("g_eval", best, "chosen: the highest return in the data set");
-    set("g_online", best, "not used: there is no environment");
+    set("g_eval", std::clamp(best, -many, many), "chosen: the highest return in the data set");
+    set("g_online", std::clamp(best, -many, many), "not used: there is no environment");
     if (largest > 0)
-        set("reward_scale", std::pow(10.0, -std::floor(std::log10(largest))),
-            "chosen: a power of ten, so that the largest return is from 1 to 10");
+        set("reward_scale", std::clamp(std::pow(10.0, -std::floor(std::log10(largest))), 1e-9, 1e9),
+            "chosen: a power of ten, so that the largest absolute return is from 1 to 10");
 }
 
 // Settings that options or what they name decide.
-constexpr std::string_view not_for_set[] = {"task",          "method",    "preset",     "seed",
-                                            "arithmetic",    "mujoco",    "dataset",    "dataset_sha256",
-                                            "first_weights", "state_dim", "action_dim", "moves"};
+constexpr std::string_view not_for_set[] = {"task",       "method",  "preset",         "seed",          "arithmetic",
+                                            "mujoco",     "dataset", "dataset_sha256", "first_weights", "state_dim",
+                                            "action_dim", "moves",   "clip_actions"};
 
 // NAME=VALUE of each --set. Errors: usage.setting.
 inline void apply_assignments(Settings& settings, const std::vector<std::string>& assignments) {
@@ -360,11 +361,12 @@ inline void apply_assignments(Settings& settings, const std::vector<std::string>
     }
 }
 
-// Whether what stands in a task's place is the path of own data: it says so by its name or by what it holds.
+// Whether what stands in a task's place is the path of own data: by its ending, or because it is there.
 inline bool is_data_file(const std::string& task) {
     const std::filesystem::path path = task;
     const bool named = path.extension() == ".hdf5" || path.extension() == ".h5";
-    return !contains(split(task_names, '|'), full_task_name(task)) && (named || std::filesystem::exists(path));
+    const bool is_task = contains(split(task_names, '|'), full_task_name(task));
+    return !is_task && (named || is_there(task));
 }
 
 // The settings of one run but for its seed, for the options that train and import share. Errors: usage.*,
@@ -467,13 +469,17 @@ inline void announce(const PlannedRun& run) {
                  run.label.c_str(), settings.task.c_str(), settings.preset.c_str(), data.c_str(), run.folder.c_str());
 }
 
-// One for each method of a sweep, all checked but for the data set, which its machine must have. Errors: usage.*.
+// One for each method of a sweep, all checked but for a task's data set, which its machine must have. Errors: usage.*,
+// and for own data those of load_own_data().
 inline std::vector<Settings> swept_settings(const Arguments& arguments) {
     std::vector<Settings> sweep;
     for (const std::string& method : split(arguments["--methods"], ',')) {
         const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
-        sweep.push_back(default_settings(is_data_file(task) ? own_data : task, method, arguments["--preset"]));
-        if (is_data_file(task)) choose_own_data(sweep.back(), task);
+        const bool own = is_data_file(task);
+        if (own && arguments.has("--dataset")) fail("usage.option", "two data sets are given; leave --dataset out");
+        sweep.push_back(default_settings(own ? own_data : task, method, arguments["--preset"]));
+        if (arguments.has("--clip-actions")) set_from(sweep.back(), "clip_actions", "yes", "command line");
+        if (own) choose_own_data(sweep.back(), task);
         apply_assignments(sweep.back(), arguments.assignments);
         check_together(sweep.back());
     }
@@ -488,6 +494,7 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
     std::string shared;
     for (const auto& [option, usual] : {std::pair("--dataset", ""), {"--kernel", "auto"}, {"--precision", "fp32"}})
         if (arguments[option] != usual) shared += std::string(" ") + option + " " + shell_word(arguments[option]);
+    if (arguments.has("--clip-actions")) shared += " --clip-actions";
     for (const std::string& assignment : arguments.assignments) shared += " --set " + shell_word(assignment);
     for (const Settings& settings : sweep)
         for (const int64_t seed : seeds)

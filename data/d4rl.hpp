@@ -94,7 +94,8 @@ constexpr const char* own_folder = "runs/datasets";
 // Returns the file of a data set: `given` itself, or that of the numbers in a folder of Minari's.
 // Errors: dataset.arrow for Minari's other form.
 inline std::string data_set_file(const std::string& given) {
-    if (!std::filesystem::is_directory(given)) return given;
+    std::error_code error;  // of a name that no file can have
+    if (!std::filesystem::is_directory(given, error)) return given;
     for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
         if (std::filesystem::exists(given + file)) return given + file;
     for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow"})
@@ -316,9 +317,11 @@ inline Rows read_minari(const Hdf5File& file, const MujocoTask* task = nullptr) 
         const std::vector<std::string> parts = dictionary ? dictionary->parts : std::vector<std::string>{""};
         std::vector<double> states = read_side_by_side(file, group + "observations", parts, steps + 1);
         const size_t columns = states.size() / (steps + 1);
-        if (rows.count == 0) rows.state_dim = columns;
-        if (rows.count == 0) rows.action_dim = actions.columns;
-        if (rows.count == 0) rows.integer_actions = is_integer(actions.data);
+        if (rows.count == 0) {
+            rows.state_dim = columns;
+            rows.action_dim = actions.columns;
+            rows.integer_actions = is_integer(actions.data);
+        }
         const bool empty = steps == 0 || columns == 0 || actions.columns == 0;
         const bool alike = columns == rows.state_dim && actions.columns == rows.action_dim;
         require(alike && !empty, "dataset.shape", file.path, ": ", group, "observations and actions have ", columns,
@@ -520,7 +523,8 @@ inline std::vector<double> transition_differences([[maybe_unused]] const Rows& r
 }
 
 // Returns what the recorded steps, or else the file's layout, tell of the bodies that made them; "" if it is those of
-// the chosen physics, or nobody knows. A tenth: of the two medians of transition_differences().
+// the chosen physics, or nobody knows. Other bodies are named if the median of their transition_differences() is less
+// than a tenth of the chosen ones'.
 inline std::string remark_on_bodies(const Rows& rows, const MujocoTask& task, const std::string& physics) {
     const auto median = [&](Physics bodies) {
         const std::vector<double> differences = transition_differences(rows, task, bodies);
@@ -532,9 +536,8 @@ inline std::string remark_on_bodies(const Rows& rows, const MujocoTask& task, co
     const char* const name = old ? "2.2" : "d4rl";
     if (10 * other < chosen)
         return text_of("other bodies made these data: recorded steps taken again end ", chosen,
-                       " from the recorded state "
-                       "under physics ",
-                       physics, ", ", other, " under ", name, "; choose these with --physics ", name);
+                       " from the recorded state under physics ", physics, ", ", other, " under ", name,
+                       "; choose these with --physics ", name);
     if (rows.of_minari && old && !(10 * chosen < other))
         return "it is of Minari's layout: if Gymnasium made the data, its bodies are those of --physics 2.2; those of "
                "physics d4rl, which train takes unless told otherwise, weigh up to 7.7% less and move otherwise";
@@ -625,6 +628,10 @@ inline OwnData load_own_data(const std::string& path, bool clip) {
                  cut_at_flags(rows, std::numeric_limits<size_t>::max())};
     require(!data.trajectories.empty(), "dataset.empty", path,
             ": no step is marked as the end of a trajectory in terminals or timeouts, so there is none");
+    const size_t width = std::max(rows.state_dim, rows.action_dim);  // a number of a trajectory is indexed by an int
+    for (const Trajectory& trajectory : data.trajectories)
+        require(trajectory.rewards.size() <= INT32_MAX / width, "dataset.shape", path, ": a trajectory has ",
+                trajectory.rewards.size(), " steps of ", width, " numbers; the most is 2^31 numbers");
     return data;
 }
 

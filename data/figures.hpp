@@ -532,7 +532,7 @@ struct Markdown {
         return out + "\n";
     }
     std::string operator()(const Figure& figure) const {
-        return "![](" + figure.file + ")\n\n" + figure.caption + "\n\n";
+        return "![](" + url_of(figure.file) + ")\n\n" + figure.caption + "\n\n";
     }
     std::string operator()(const Files& files) const {
         std::string out = files.label + ":";

@@ -43,7 +43,8 @@ inline void print_data_set(const std::string& path, std::string id) {
     const Rows rows = read_data_set(file, task);
     if (!task)
         std::printf("The name tells no task, so there is no score, and flags alone end trajectories (see --task)\n");
-    const std::vector<Trajectory> trajectories = task ? cut_trajectories(rows, *task, path) : cut_at_flags(rows, 1000);
+    const std::vector<Trajectory> trajectories =
+        task ? cut_trajectories(rows, *task, path) : cut_at_flags(rows, std::numeric_limits<size_t>::max());
     const DataSetStatistics statistics = statistics_of(rows, trajectories);
     std::printf("rows:         %zu, %zu state and %zu action numbers\n%s", rows.count, rows.state_dim, rows.action_dim,
                 describe(statistics).c_str());

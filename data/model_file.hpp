@@ -139,15 +139,21 @@ inline Settings settings_in(const TensorFile& file) { return settings_from_text(
 // Demands that a file is large enough for the network of its settings, before a network of that size is allocated.
 // Errors: model.settings.
 inline void require_room(const TensorFile& file, const Settings& settings) {
-    const int64_t weights = 12 * settings.layers * settings.width * settings.width;
-    const bool enough = static_cast<uint64_t>(weights) <= file.buffer.size() / about(DType::F16).size;
-    require(settings.width % settings.heads == 0 && enough, "model.settings", file.path, ": does not hold the ",
-            weights, " weights and more that its settings call for");
+    const bool sizes = settings.task != own_data || (settings.state_dim > 0 && settings.action_dim > 0 &&
+                                                     (settings.moves == 0 || settings.action_dim == 1));
+    require(sizes && settings.width % settings.heads == 0, "model.settings", file.path,
+            ": its settings state_dim, action_dim, moves, or width and heads do not go together");
+    const EnvironmentSpec spec = spec_of(settings);
+    const int64_t numbers = spec.state_dim + 2 * std::max(spec.action_dim, spec.discrete_actions);
+    const int64_t weights = settings.width * (12 * settings.layers * settings.width + numbers);
+    require(static_cast<uint64_t>(weights) <= file.buffer.size() / about(DType::F16).size, "model.settings", file.path,
+            ": does not hold the ", weights, " weights and more that its settings call for");
 }
 
 // Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
 inline std::string model_path(const std::string& given) {
-    return std::filesystem::is_directory(given) ? given + "/model.safetensors" : given;
+    std::error_code error;  // of a name that no file can have
+    return std::filesystem::is_directory(given, error) ? given + "/model.safetensors" : given;
 }
 
 // Errors: model.format, model.settings, safetensors.*, file.*.
@@ -163,7 +169,7 @@ inline TensorFile open_model(const std::string& given) {
 // open_model(), checkpoint.format.
 inline TensorFile open_model_or_checkpoint(const std::string& given) {
     const std::string checkpoint = given + "/checkpoint.safetensors";
-    if (std::filesystem::exists(model_path(given)) || !std::filesystem::exists(checkpoint)) return open_model(given);
+    if (is_there(given + "/finished") || !is_there(checkpoint)) return open_model(given);
     TensorFile file = read_own_safetensors(checkpoint);
     require(file.text("format") == checkpoint_format, "checkpoint.format", checkpoint,
             " is no checkpoint of this version of `wodtem train`");
@@ -292,7 +298,9 @@ void import_odt(const TensorFile& file, const Settings& settings, const std::str
     require(model.state_mean.empty() == model.state_std.empty(), "import.metadata", file.path,
             ": has one of state_mean and state_std; it needs both, or neither");
     if (model.state_mean.empty()) {
-        require(settings.behaviour != "random", "import.normaliser", file.path,
+        const bool has_data =
+            settings.behaviour != "random" && (settings.task != own_data || !settings.dataset_path.empty());
+        require(has_data, "import.normaliser", file.path,
                 " has no state_mean and state_std, and there is no data set to take them from; see --dataset");
         find_statistics(model);
     }

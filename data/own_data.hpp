@@ -58,34 +58,41 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
     return steps > 0 ? HeldOut{log_probs / steps, errors / steps} : HeldOut{};
 }
 
-void print_held_out(const Run& run, const HeldOut& held_out, size_t trajectories) {
-    std::printf("%zu trajectories held out: log-probability of an action %s, %s %s; after %s updates\n", trajectories,
+void print_held_out(const Run& run, const std::string& path, const HeldOut& held_out, size_t trajectories) {
+    std::printf("%s: %s updates; %zu trajectories held out: log-probability of an action %s, %s %s\n", path.c_str(),
+                number_text(run.progress.updates).c_str(), trajectories,
                 number_text(static_cast<float>(held_out.log_prob)).c_str(),
                 run.agent.discrete() ? "share of other moves" : "squared error of the mean",
-                number_text(static_cast<float>(held_out.error)).c_str(), number_text(run.progress.updates).c_str());
+                number_text(static_cast<float>(held_out.error)).c_str());
 }
 
-// The offline phase on own data. Measures before the first update, and ten times on the way.
-void fit_own_data(Run& run, const Observer& observer) {
+// The offline phase on own data. Measures before the first update, and after each tenth of all updates; as in the other
+// phases, what is left to do follows from the state alone: progress.evaluations counts the rows.
+void fit_own_data(Run& run, const Observer& observer, const std::string& path) {
     const std::vector<Trajectory> held_out = part_of_own_data(run.agent.settings, true);
+    if (held_out.empty()) std::fprintf(stderr, "%s: no trajectory is held out, so nothing is measured\n", path.c_str());
+    Progress& p = run.progress;
     const uint64_t updates = static_cast<uint64_t>(run.agent.settings.offline_updates);
-    const uint64_t every = std::max<uint64_t>(1, updates / 10);
-    const auto report = [&] {
-        const HeldOut measured = measure(run.agent, run.acting, held_out);
-        ProgressRow row = progress_row(run);
-        row.held_out_log_prob = measured.log_prob;
-        row.held_out_error = measured.error;
-        observer.evaluated(row, {});
-        run.tally = {};
-    };
-    if (run.progress.updates == 0) report();
-    while (run.progress.updates < updates) {
+    const uint64_t every = std::max<uint64_t>(1, (updates + 9) / 10);
+    HeldOut measured;
+    while (true) {
+        const bool last = p.updates >= updates;
+        const uint64_t due = 1 + p.updates / every + (last && updates % every != 0);
+        if (last) observer.ending();
+        if (p.evaluations != due || last) {
+            measured = measure(run.agent, run.acting, held_out);
+            ProgressRow row = progress_row(run);
+            row.held_out_log_prob = measured.log_prob;
+            row.held_out_error = measured.error;
+            observer.evaluated(row, {});
+            p.evaluations = due;
+            run.tally = {};
+        }
+        if (last) break;
         update(run);
-        if (run.progress.updates == updates) observer.ending();
-        if (run.progress.updates % every == 0 || run.progress.updates == updates) report();
-        observer.pause(static_cast<double>(run.progress.updates) / static_cast<double>(updates));
+        observer.pause(static_cast<double>(p.updates) / static_cast<double>(updates));
     }
-    print_held_out(run, measure(run.agent, run.acting, held_out), held_out.size());
+    print_held_out(run, path, measured, held_out.size());
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -137,11 +144,14 @@ std::vector<double> numbers_of_line(const std::string& line, size_t number, size
     return values;
 }
 
-// The action for an episode's present state; the episode goes on by it. acting: a tape that does not record.
+// The action for an episode's present state; the episode goes on by it. Nothing if the policy has no finite answer.
+// acting: a tape that does not record.
 std::vector<float> act(const Agent& agent, Tape<float>& acting, Episode& episode) {
     acting.reset();
     Episode* const one[] = {&episode};
     const Policy<float> policy = forward(acting, agent.model, acting_batch(agent, one), Queries::last_state);
+    for (int i = 0; i < policy.output.columns; ++i)
+        if (!std::isfinite(policy.output.value[i])) return {};
     const std::vector<float> action = choose_action(agent, policy, 0, Act::most_likely, Random{}, 0, 0);
     append_all(episode.trajectory.states, episode.state);
     append_all(episode.trajectory.actions, action);
@@ -150,32 +160,38 @@ std::vector<float> act(const Agent& agent, Tape<float>& acting, Episode& episode
 }
 
 // Answers each line of the file, or of standard input if the name is empty, at once: another program may be waiting.
-// Errors: act.line, file.read.
+// Ends when nobody reads the answers any more. Errors: act.line, act.not_finite, file.read.
 void act_on_lines(const Agent& agent, Tape<float>& acting, const std::string& path) {
     const FrozenWeights frozen(acting.compute);
     std::ifstream file;
     if (!path.empty()) file.open(path);
     require(!file.fail(), "file.read", "cannot open ", path, ": ", std::strerror(errno));
     std::istream& input = path.empty() ? std::cin : file;
+    const size_t state_dim = agent.spec.state_dim;
     Episode episode;
     std::string line;
-    for (size_t number = 1; std::getline(input, line); ++number) {
+    size_t number = 0;
+    while (std::getline(input, line) && !std::ferror(stdout)) {
+        ++number;
         if (line.ends_with('\r')) line.pop_back();
         if (trimmed(line).empty()) {
             episode = {};
             continue;
         }
-        const size_t state_dim = agent.spec.state_dim;
         const std::vector<double> values = numbers_of_line(line, number, state_dim);
         episode.state.assign(values.end() - static_cast<ptrdiff_t>(state_dim), values.end());
         if (values.size() > state_dim)
             episode.targets.push_back(static_cast<float>(values[0] * agent.settings.reward_scale));
         else  // the reward is not known: what is wanted stays
             append_target(episode, agent.settings.g_eval, agent.settings.reward_scale);
+        const std::vector<float> action = act(agent, acting, episode);
+        require(!action.empty(), "act.not_finite", "line ", number,
+                " of the input: the policy has no finite answer; are state and return in the data's units?");
         std::string answer;
-        for (const float number_of_action : act(agent, acting, episode)) answer += number_text(number_of_action) + ",";
+        for (const float one : action) answer += number_text(one) + ",";
         answer.back() = '\n';
         std::printf("%s", answer.c_str());
         std::fflush(stdout);
     }
+    require(!input.bad(), "file.read", "cannot read ", path.empty() ? "standard input" : path, " beyond line ", number);
 }

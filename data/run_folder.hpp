@@ -335,6 +335,13 @@ inline void make_folder(const std::string& path, const char* id) {
     require(!problem, id, "cannot make the folder ", path, ": ", problem.message());
 }
 
+// Errors: run.folder.
+inline void rename_file(const std::string& from, const std::string& to) {
+    std::error_code problem;
+    std::filesystem::rename(from, to, problem);
+    require(!problem, "run.folder", "cannot rename ", from, " to ", to, ": ", problem.message());
+}
+
 // Keeps other processes out of a folder for as long as it lives; the system releases it however the process ends.
 // Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
 struct FolderLock : File {
@@ -348,17 +355,18 @@ struct FolderLock : File {
     }
 };
 
-// A run that was stopped, or that kept its state, goes on with larger budgets: its state becomes a checkpoint, and its
-// model, which the state contains, goes away. Errors: run.not_kept.
+// A run that was stopped, or that kept its state, goes on with larger budgets: its state becomes a checkpoint. Its model
+// stays until the run is finished again. Errors: run.not_kept, run.folder.
 inline void go_on(const RunFolder& folder, const Settings& begun, const Settings& settings) {
     const bool kept = folder.has("kept.safetensors"), has_state = kept || folder.has("checkpoint.safetensors");
     require(has_state || !folder.has("finished"), "run.not_kept", folder.path,
             " is finished and has not kept its state; train with --keep-state to go on with a larger budget later");
-    if (kept) std::filesystem::rename(folder.file("kept.safetensors"), folder.file("checkpoint.safetensors"));
-    for (const char* name : {"finished", "model.safetensors"}) std::filesystem::remove(folder.file(name));
-    AppendFile(folder.file("budgets"))
-        .write("offline_updates = " + number_text(begun.offline_updates) +
-               ", online_steps = " + number_text(begun.online_steps) + "\n");
+    if (kept) rename_file(folder.file("kept.safetensors"), folder.file("checkpoint.safetensors"));
+    std::filesystem::remove(folder.file("finished"));
+    const std::string line =
+        text_of("offline_updates = ", begun.offline_updates, ", online_steps = ", begun.online_steps, "\n");
+    const std::string path = folder.file("budgets"), before = folder.has("budgets") ? read_file(path) : "";
+    if (!before.ends_with(line)) write_file_atomic(path, before + line);
     write_file_atomic(folder.file("settings"), settings_text(settings));
 }
 
@@ -443,7 +451,7 @@ struct CheckpointTimer {
 inline void retire_checkpoint(const RunFolder& folder, bool keep) {
     if (!folder.has("checkpoint.safetensors")) return;
     if (keep)
-        std::filesystem::rename(folder.file("checkpoint.safetensors"), folder.file("kept.safetensors"));
+        rename_file(folder.file("checkpoint.safetensors"), folder.file("kept.safetensors"));
     else
         std::filesystem::remove(folder.file("checkpoint.safetensors"));
 }

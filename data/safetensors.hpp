@@ -173,6 +173,12 @@ inline void write_file_atomic(const std::string& path, std::string_view bytes) {
     file.commit();
 }
 
+// Whether there is a file or folder of this name; no for a name that none can have.
+inline bool is_there(const std::string& path) {
+    std::error_code error;
+    return std::filesystem::exists(path, error);
+}
+
 // Removes the temporaries that killed processes left in a folder in which no other process writes now.
 inline void remove_temporaries(const std::string& folder) {
     std::error_code none;

@@ -453,6 +453,11 @@ inline void check_together(const Settings& settings) {
     const bool gridworld = settings.task == "gridworld", own = settings.task == own_data;
     if (own && (settings.state_dim == 0 || settings.action_dim == 0 || (settings.moves > 0 && settings.action_dim > 1)))
         fail("usage.setting", "the task data is chosen by giving a file: wodtem train FILE.hdf5");
+    const long long outputs = std::max(settings.moves, settings.action_dim);  // the head's rows are orthonormal
+    if (own && outputs > width && (settings.moves > 0 || settings.method != "dt"))
+        fail("usage.setting", "width %lld is less than the %lld moves or action numbers; give --set width=%lld or more",
+             width, outputs, divide_up(outputs, heads) * heads);
+    if (own && settings.behaviour != "recorded") fail("usage.setting", "own data have behaviour recorded");
     if (own && online_steps > 0)
         fail("usage.setting", "online_steps must be 0, not %lld: own data have no environment", online_steps);
     if (!own && settings.held_out > 0)
@@ -504,7 +509,7 @@ inline std::string source_of(const Settings& settings, const SettingRow& row) {
     return source == settings.source.end() ? row.source : source->second;
 }
 
-// A setting that came later: files do not have it where it is at its initial value, and so are as they were before.
+// A setting that came later: files do not have it where nothing has set it, and so are as they were before.
 inline bool is_later(const SettingRow& row) {
     constexpr std::string_view later[] = {"clip_actions", "held_out", "state_dim", "action_dim", "moves"};
     return contains(later, row.name);
@@ -513,7 +518,7 @@ inline bool is_later(const SettingRow& row) {
 inline std::string settings_text(const Settings& settings) {
     std::string text;
     for (const SettingRow& row : setting_rows) {
-        if (is_later(row) && setting_text(settings, row) == setting_text({}, row)) continue;
+        if (is_later(row) && !settings.source.contains(row.name)) continue;
         std::string line = std::string(row.name) + " = " + quoted(setting_text(settings, row));
         line.resize(std::max<size_t>(line.size() + 1, 40), ' ');
         text += line + "# " + source_of(settings, row) + "\n";
@@ -570,7 +575,8 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
 }
 
 // The settings of a run that is to go on with larger budgets, which have no other effect on what came before: more
-// interactions, or more offline updates of a run that has no online phase yet.
+// interactions, or more offline updates of a run that has no online phase yet. (Own data's rows of progress.csv lie at
+// tenths of the budget that they were made under.)
 inline Settings with_larger_budgets(Settings found, const Settings& wanted) {
     if (found.online_steps == 0) found.offline_updates = std::max(found.offline_updates, wanted.offline_updates);
     found.online_steps = std::max(found.online_steps, wanted.online_steps);
@@ -614,7 +620,8 @@ inline std::string train_command(const Settings& settings) {
                                                        : std::filesystem::absolute(settings.weights_path).string());
     if (settings.arithmetic == "plain") add("--kernel", "portable");
     if (settings.arithmetic == "bf16") add("--precision", "bf16");
-    const std::set<std::string> written{"task", "method", "preset", "seed", "arithmetic", "physics"};
+    if (settings.clip_actions) command += " --clip-actions";
+    const std::set<std::string> written{"task", "method", "preset", "seed", "arithmetic", "physics", "clip_actions"};
     for (const SettingRow& row : setting_rows)
         if (source_of(settings, row) == "command line" && !written.contains(row.name))
             add("--set", std::string(row.name) + "=" + setting_text(settings, row));
@@ -700,9 +707,10 @@ inline std::unique_ptr<Environment> make_environment(const Settings& settings) {
 #endif
 }
 
-// The task; of own data the file's name, without the ending.
+// What folders and figures of a run are called after: the task, or data-FILE for own data, without the file's ending.
 inline std::string data_name(const Settings& settings) {
-    return settings.task == own_data ? std::filesystem::path(settings.dataset).stem().string() : settings.task;
+    return settings.task == own_data ? "data-" + std::filesystem::path(settings.dataset).stem().string()
+                                     : settings.task;
 }
 
 // The score of a return: D4RL's normalised score, and on the grid world the return itself.

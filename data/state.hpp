@@ -6,6 +6,7 @@
 #pragma once
 
 #include "../memory.hpp"  // and with it nn.hpp and the standard headers
+#include "settings.hpp"
 
 // Errors: checkpoint.entry names the entry and the condition that no run can have broken.
 inline void require_entry(bool holds, const std::string& entry, const char* condition) {
@@ -169,9 +170,11 @@ void check_state(auto& run) {
     const uint64_t due = offline + p.episodes * each;
     require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
                   "does not fit progress.episodes");
-    require_entry(p.evaluations <= (online ? 1 + p.episodes / every : 0) && (!online || p.evaluations >= 1),
-                  "progress.evaluations", "does not fit progress.episodes");
-    require_entry(p.next_evaluation == p.evaluations * every && p.next_evaluation >= p.episodes,
+    const bool own = settings.task == own_data;  // whose measurements are counted: see fit_own_data()
+    const uint64_t most_evaluations = own ? p.updates + 1 : online ? 1 + p.episodes / every : 0;
+    require_entry(p.evaluations <= most_evaluations && (!online || p.evaluations >= 1), "progress.evaluations",
+                  "does not fit progress.episodes");
+    require_entry(p.next_evaluation == (own ? 0 : p.evaluations * every) && p.next_evaluation >= p.episodes,
                   "progress.next_evaluation", "does not fit progress.evaluations and progress.episodes");
     require_entry(!std::isinf(p.eval_length), "progress.eval_length", "is infinite");
     require_entry(!std::isinf(p.eval_return), "progress.eval_return", "is infinite");

@@ -31,8 +31,9 @@ void require_same(bool same) {
 
 // What a file asks for is its own affair, as long as it is honest; what it costs here is not.
 bool is_small(const Settings& s) {
-    return s.task == "gridworld" && s.layers <= 2 && s.width <= 32 && s.context_length <= 32 && s.batch_size <= 64 &&
-           s.table_size <= 100000 && s.eval_episodes <= 4 && s.data_trajectories <= 100 && s.projected_dim <= 64;
+    return (s.task == "gridworld" || (s.task == own_data && std::max({s.state_dim, s.action_dim, s.moves}) <= 32)) &&
+           s.layers <= 2 && s.width <= 32 && s.context_length <= 32 && s.batch_size <= 64 && s.table_size <= 100000 &&
+           s.eval_episodes <= 4 && s.data_trajectories <= 100 && s.projected_dim <= 64;
 }
 
 Compute& compute() {
@@ -49,14 +50,18 @@ void hdf5(const std::string& input) {
             file.read_flags(*dataset);
         } catch (const Error&) {
         }
-    const Rows rows = is_minari(file) ? read_minari(file) : read_rows(file);
-    describe(statistics_of(rows, cut_at_flags(rows, 1000)));
     for (const char* name : {"hopper-medium-v2", "antmaze-umaze-v2", "maze2d-umaze-v1"}) try {
-            const std::vector<Trajectory> trajectories = cut_trajectories(rows, *find_mujoco_task(name), "input");
+            const MujocoTask& task = *find_mujoco_task(name);
+            const Rows rows = read_data_set(file, &task);
+            const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, "input");
             require_sound(rows, "input");
             describe(statistics_of(rows, trajectories));
+            remarks_on(rows, task, "d4rl");
         } catch (const Error&) {
         }
+    const Rows rows = read_data_set(file);
+    describe(statistics_of(rows, cut_at_flags(rows, 1000)));
+    number_of_moves(rows, "input");
 }
 
 // tests/hdf5/*.z: the size in 8 bytes, then a zlib stream.
@@ -103,6 +108,14 @@ void model(const std::string& input) {
     load_model(contents, file);
     Tape<float> acting(compute());
     acting.recording = false;
+    if (s.task == own_data) {
+        Episode episode;
+        for (episode.state.resize(s.state_dim); episode.trajectory.length() < 3;) {
+            append_target(episode, s.g_eval, s.reward_scale);
+            if (act(agent, acting, episode).empty()) break;
+        }
+        return;
+    }
     evaluate(agent, acting, Environments(*make_environment(s), s.eval_episodes).all(),
              first_of_last_evaluation(contents, s));
 }
@@ -122,8 +135,8 @@ void import(const std::string& input) {
 // The files of a run folder, each ended by a byte 0.
 void report(const std::string& input) {
     const std::vector<std::string> parts = split(input, '\0');
-    const char* const names[] = {"settings",          "progress.csv", "episodes.csv", "policy.csv",
-                                 "start_actions.csv", "paths.csv",    "finished"};
+    const char* const names[] = {"settings",  "progress.csv", "episodes.csv", "policy.csv", "start_actions.csv",
+                                 "paths.csv", "finished",     "seconds.csv",  "command"};
     for (size_t i = 0; i < std::size(names); ++i) {
         std::filesystem::remove(scratch() + "/run/" + names[i]);
         if (i < parts.size()) put(std::string("run/") + names[i], parts[i]);

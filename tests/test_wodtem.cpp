@@ -1212,18 +1212,37 @@ TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
     const size_t column = progress.header.size() - 2;
     CHECK_EQUAL(progress.header[column], "held_out_log_prob");
     CHECK(*to_number(progress.rows.back()[column]) > *to_number(progress.rows.front()[column]));
-    CHECK(*to_number(progress.rows.back()[9]) > 0);  // some steps fall short of the memory
-    train_until(settings, scratch / "parts", 40);
-    quiet_train(settings, scratch / "parts");
-    for (const char* name : {"progress.csv", "model.safetensors"})
-        CHECK(read_file(scratch / "whole/" + name) == read_file(scratch / "parts/" + name));
+    CHECK(*to_number(progress.rows.back()[9]) > 0);                   // some steps fall short of the memory
+    for (uint64_t asked = 2; asked < 3000; asked += 1 + asked / 3) {  // stopped anywhere, also while it measures
+        const std::string parts = scratch / "parts" + std::to_string(asked);
+        train_until(settings, parts, asked);
+        quiet_train(settings, parts);
+        for (const char* name : {"progress.csv", "model.safetensors"})
+            CHECK(read_file(scratch / "whole/" + name) == read_file(parts + "/" + name));
+    }
+    Settings smaller = settings;
+    smaller.offline_updates = 23;  // no multiple of ten: a row for each third update, and the last
+    quiet_train(
+        smaller, scratch / "longer", 1, 1e9, [] { return false; }, true);
+    CHECK_EQUAL(results::Log(scratch / "longer/progress.csv").table.rows.size(), 9u);
+    quiet_train(settings, scratch / "longer");
+    CHECK(read_file(scratch / "whole/model.safetensors") == read_file(scratch / "longer/model.safetensors"));
     const std::string command = read_file(scratch / "whole/command");
     check_shell(command.substr(0, command.size() - 1) + " --out " + scratch / "again", 0, "trajectories held out");
     CHECK(read_file(scratch / "whole/model.safetensors") == read_file(scratch / "again/model.safetensors"));
     check_shell("./wodtem report " + scratch / "whole --out " + scratch / "report", 0, "log-probability, held out");
-    CHECK(fs::exists(scratch / "report/own-small-held-out.svg"));
+    CHECK(fs::exists(scratch / "report/data-own-small-held-out.svg"));
     check_shell("./wodtem eval " + scratch / "whole", 1, "own data have no environment");
+    fs::rename(settings.dataset_path, scratch / "gridworld.hdf5");  // beside the grid world, whose name it has
+    quiet_train(tiny_settings("wodtem"), scratch / "grid");
+    check_shell("./wodtem train " + scratch / "gridworld.hdf5 --set offline_updates=5 --out " + scratch / "named", 0,
+                "5 upd");
+    check_shell("./wodtem report " + scratch / "named " + scratch / "grid --out " + scratch / "both", 0,
+                "gridworld, pre");
+    fs::rename(scratch / "gridworld.hdf5", settings.dataset_path);
     check_shell("./wodtem train data", 2, "wodtem train FILE.hdf5");
+    check_shell("./wodtem train " + std::string(300, 'x'), 2, "task cannot be");
+    check_shell("./wodtem train " + settings.dataset_path + " --set width=8 --set heads=2 --set moves=9", 2, "moves");
     check_shell("./wodtem train " + scratch / "none.hdf5", 1, "none.hdf5");
     check_shell("./wodtem train " + settings.dataset_path + " --set online_steps=5", 2, "must be 0");
     check_shell("./wodtem sweep " + settings.dataset_path + " --seeds 3", 0, "own.hdf5 --method wodtem --preset small");
@@ -1252,7 +1271,8 @@ TEST(a_larger_budget_goes_on_to_the_bytes_of_a_run_that_had_it_from_the_start) {
             smaller, parts, 1, 1e9, [] { return false; }, true);  // is finished already
         CHECK(read_file(parts + "/model.safetensors") == model && fs::exists(parts + "/kept.safetensors"));
         train_until(larger, parts, 60);  // and is stopped on the way
-        CHECK(!fs::exists(parts + "/finished") && !fs::exists(parts + "/model.safetensors"));
+        CHECK(!fs::exists(parts + "/finished") && read_file(parts + "/model.safetensors") == model);
+        check_shell("./wodtem eval " + parts, 0, "run is unfinished");  // not of the model of before
         CHECK_FAILS("run.other_settings", quiet_train(smaller, parts));
         quiet_train(larger, parts);
         check_same_results(whole, parts);
@@ -1260,6 +1280,28 @@ TEST(a_larger_budget_goes_on_to_the_bytes_of_a_run_that_had_it_from_the_start) {
                     "offline_updates = 40, online_steps = " + std::to_string(smaller.online_steps) + "\n");
         CHECK(!fs::exists(parts + "/kept.safetensors") && !fs::exists(parts + "/checkpoint.safetensors"));
     }
+}
+
+// A model file of own data with sizes that no run can have is refused before anything of that size is allocated.
+TEST(a_model_of_own_data_with_wrong_sizes_is_refused) {
+    const Scratch scratch;
+    quiet_train(own_settings(grid_file(scratch), "odt"), scratch / "run");
+    const TensorFile file = open_model(scratch / "run");
+    const Settings settings = settings_in(file);
+    for (const auto& [state_dim, action_dim, moves] : {std::array<int64_t, 3>{0, 1, 8},
+                                                       {2, 0, 8},
+                                                       {2, 5, 8},
+                                                       {2, 0, 0},
+                                                       {100000, 1, 8},
+                                                       {2, 100000, 0},
+                                                       {2, 1, 10000}}) {
+        Settings wrong = settings;
+        wrong.state_dim = state_dim;
+        wrong.action_dim = action_dim;
+        wrong.moves = moves;
+        CHECK_FAILS("model.settings", require_room(file, wrong));
+    }
+    require_room(file, settings);
 }
 
 // What `act` answers to the states and returns-to-go of an evaluation is what was done there.
@@ -1286,6 +1328,11 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     check_shell("echo 1,2,3,4 | " + act, 1, "line 1 of the input has 4 numbers; expected the 2 of a state");
     check_shell("printf '0,0\\n0,x\\n' | " + act, 1, "line 2 of the input: \"x\" is not a finite number");
     check_shell("echo 1e99,0 | " + act, 1, "is not a finite number");
+    check_shell("echo 3e38,1,1 | " + act, 1, "line 1 of the input: the policy has no finite answer");
+    check_shell(act + scratch.path, 1, "cannot read " + scratch.path);
+    check_shell("yes 1,1 | " + act + "| head -n 2", 0, "\n");
+    CHECK_EQUAL(shell("printf '0,0\\n5,1,1\\n2,2\\n' | " + act).text,
+                shell("printf '1,0,0\\n5,1,1\\n5,2,2\\n' | " + act).text);
     check_shell(act + scratch / "absent", 1, "cannot open");
     check_shell(act + "--set alpha=0.5", 2, "eval and act take --set");
 }
