@@ -6,7 +6,6 @@
 #pragma once
 
 #include "../memory.hpp"  // and with it nn.hpp and the standard headers
-#include "settings.hpp"
 
 // Errors: checkpoint.entry names the entry and the condition that no run can have broken.
 inline void require_entry(bool holds, const std::string& entry, const char* condition) {
@@ -170,7 +169,7 @@ void check_state(auto& run) {
     const uint64_t due = offline + p.episodes * each;
     require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
                   "does not fit progress.episodes");
-    const bool own = settings.task == own_data;  // whose measurements are counted: see fit_own_data()
+    const bool own = settings.state_dim > 0;  // own data, whose measurements are counted: see fit_own_data()
     const uint64_t most_evaluations = own ? p.updates + 1 : online ? 1 + p.episodes / every : 0;
     require_entry(p.evaluations <= most_evaluations && (!online || p.evaluations >= 1), "progress.evaluations",
                   "does not fit progress.episodes");

@@ -97,6 +97,22 @@ TEST(crc32_gives_the_published_check_value) {
     CHECK_EQUAL(crc32(std::string(32, '\0')), 0x190A55ADu);  // zlib.crc32(bytes(32))
 }
 
+// Bit by bit, as CRC-32/ISO-HDLC is defined, over the header with its own digits, bytes 41 to 48, as zeros.
+TEST(the_checksum_of_a_header_is_that_of_its_definition) {
+    TensorFile file;
+    file.metadata = {{"a key", "a text"}};
+    file.add("a", {2}, std::array{1.0f, 2.0f});
+    std::string header = file_start(file);
+    const std::string digits = header.substr(41, 8);
+    header.replace(41, 8, "00000000");
+    uint32_t crc = 0xFFFFFFFF;
+    for (const char byte : header) {
+        crc ^= static_cast<uint8_t>(byte);
+        for (int bit = 0; bit < 8; ++bit) crc = crc % 2 == 1 ? crc >> 1 ^ 0xEDB88320 : crc >> 1;
+    }
+    CHECK_EQUAL(digits, hex8(~crc));
+}
+
 TEST(crc32_of_parts_equals_crc32_of_the_whole) {
     std::string text;
     for (int i = 0; i < 100; ++i) text += static_cast<char>(i * 37 % 251);

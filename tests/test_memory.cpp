@@ -326,6 +326,8 @@ TEST(relabel_refuses_wrong_sizes_and_numbers_that_are_not_finite) {
     bad.states.pop_back();
     CHECK_FAILS("memory.shape", relabel(bad, 1, 1, gamma_dr));
     CHECK_FAILS("memory.shape", bad = Trajectory{}; relabel(bad, 1, 1, gamma_dr));
+    CHECK_FAILS("memory.shape", bad = good; bad.states.resize(6); relabel(bad, 1, 1, gamma_dr));
+    CHECK_FAILS("memory.shape", bad = good; bad.actions.resize(6); relabel(bad, 1, 1, gamma_dr));
     for (const float evil : {NAN, INFINITY, -INFINITY}) {
         CHECK_FAILS("memory.not_finite", bad = good; bad.states[2] = evil; relabel(bad, 1, 1, gamma_dr));
         CHECK_FAILS("memory.not_finite", bad = good; bad.actions[1] = evil; relabel(bad, 1, 1, gamma_dr));

@@ -889,3 +889,53 @@ TEST(csv_errors_name_the_line) {
                     path + ": line 3: column \"step\" holds \"1000\", expected a number from 0 to 999");
     }
 }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The runs of data/RESULTS.md that are stored in data/results.
+
+namespace {
+// The row of a table of a page that begins with these cells.
+std::string row_of(const std::string& page, const std::string& first_cells) {
+    const size_t at = page.find("\n| " + first_cells + " |");
+    return at == std::string::npos ? "" : page.substr(at + 1, page.find('\n', at + 1) - at - 1);
+}
+
+std::string one_decimal(const Spread& spread) {
+    return svg::grouped(spread.mean, 1) + " ± " + svg::grouped(spread.deviation, 1);
+}
+}  // namespace
+
+// Each archive holds run folders; the figures that the page shows of them, and its numbers, are those of the program.
+TEST(stored_runs_redraw_the_figures_and_give_the_numbers_of_the_results_page) {
+    const std::string page = read_file("data/RESULTS.md");
+    size_t figures = 0;
+    for (const auto& archive : std::filesystem::directory_iterator("data/results")) {
+        const TemporaryFolder folder;
+        const std::string unpack = "tar -xzf " + archive.path().string() + " -C " + folder.path;
+        CHECK_EQUAL(std::system(unpack.c_str()), 0);
+        const std::string out = folder.path + "/report";
+        report({folder.path}, out);
+        for (const auto& drawn : std::filesystem::directory_iterator(out)) {
+            const std::string shown = "data/figures/" + drawn.path().filename().string();
+            if (!std::filesystem::exists(shown)) continue;
+            ++figures;
+            if (read_file(drawn.path()) != read_file(shown)) report_failure(__FILE__, __LINE__, shown + " is another");
+        }
+    }
+    CHECK_EQUAL(figures, size_t{9});
+    const TemporaryFolder folder;
+    CHECK_EQUAL(std::system(("tar -xzf data/results/maze2d-reduced.tar.gz -C " + folder.path).c_str()), 0);
+    for (const auto& [method, label] : {std::pair("odt", "ODT"), {"wodtem", "WODTEM"}}) {
+        std::vector<Run> runs;
+        for (int seed = 0; seed < 5; ++seed)
+            runs.push_back(read_run(folder.path + "/large-" + method + "-" + std::to_string(seed)));
+        Runs pointers;
+        for (const Run& run : runs) pointers.push_back(&run);
+        const std::string row = row_of(page, std::string("large | ") + label + " | 0 to 4");
+        for (const Summary summary : {last_ten, final_value}) {
+            const std::string number = one_decimal(spread_of(pointers, summary, "eval_score"));
+            if (row.find("| " + number + " |") == std::string::npos)
+                report_failure(__FILE__, __LINE__, number + " is not in: " + row);
+        }
+    }
+}

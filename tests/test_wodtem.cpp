@@ -518,6 +518,7 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
         short_pairs += falls_short;
     }
     CHECK_EQUAL(f.run.tally.short_pairs, short_pairs);
+    CHECK(f.run.tally.unmatched_pairs == 0 && f.run.tally.pairs == 512);  // every state of the data is in the table
     CHECK(short_pairs > 0 && short_pairs < 512);
     // The dose: a quarter of each pair that falls short goes from its move to the advised one.
     std::array<double, 8> moved = {};
@@ -774,6 +775,48 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
 TEST(a_move_of_probability_zero_is_never_drawn) {
     const float log_p[] = {-INFINITY, 0, -INFINITY};
     for (const double uniform : {0.0, 0.5, 1 - 0x1p-53}) CHECK_EQUAL(sampled_action(log_p, 3, uniform), 1);
+}
+
+// WODTEM sec. IV-B.1: each neighbour of a look-up has been accessed, and what an episode brings that is known counts as
+// matched, whether it is improved or kept.
+TEST(look_ups_access_all_neighbours_and_known_states_are_matched) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "K", "3");
+    set_setting(settings, "epsilon", "1.5");  // the cell itself and those beside it
+    Fixture f(settings);
+    Batch batch = sample_batch(f.run, 0, 32);
+    consult_memory(f.run, batch);
+    uint64_t found = 0;
+    for (size_t i = 0; i < batch.neighbours.size(); ++i) found += batch.neighbours[i].size();
+    const uint64_t before = f.run.memory.accesses;
+    count_lookups(f.run, batch);
+    CHECK(found > 32 && f.run.memory.accesses == before + found);
+    Trajectory known = f.run.replay.trajectories[0];
+    std::fill(known.rewards.begin(), known.rewards.end(), 10.0f);  // better than anything before
+    relabel(known, 2, 1, settings.gamma);
+    f.run.tally.matched = 0;
+    remember(f.run, known);
+    CHECK_EQUAL(f.run.tally.matched, static_cast<double>(known.length()));
+}
+
+namespace {
+// The grid world, noting the numbers of its episodes.
+struct Numbered : GridWorld {
+    std::vector<uint64_t> numbers;
+    void reset(const Random& random, uint64_t episode, float* state) override {
+        numbers.push_back(episode);
+        GridWorld::reset(random, episode, state);
+    }
+};
+}  // namespace
+
+TEST(episodes_of_evaluations_are_numbered_apart_from_those_of_training) {
+    Fixture f(tiny_settings("odt"));
+    Numbered worlds[2];
+    Environment* const environments[] = {&worlds[0], &worlds[1]};
+    evaluate(f.run.agent, f.run.acting, environments, 6);
+    CHECK(worlds[0].numbers == std::vector<uint64_t>{(uint64_t{1} << 40) + 6});
+    CHECK(worlds[1].numbers == std::vector<uint64_t>{(uint64_t{1} << 40) + 7});
 }
 
 namespace {
@@ -1041,6 +1084,47 @@ TEST(evaluation_needs_the_model_file_alone) {
     const Evaluation evaluation = evaluate(f.run.agent, f.run.acting, environments, 0);
     CHECK_EQUAL(number_text(evaluation.mean_length), progress.rows.back()[12]);
     CHECK_EQUAL(number_text(evaluation.mean_return), progress.rows.back()[13]);
+}
+
+// Two returns, 1 and 3: mean 2, standard deviation with the divisor n - 1 the root of 2.
+TEST(eval_prints_the_deviation_of_a_sample) {
+    const Scratch scratch;
+    std::vector<Episode> episodes(2);
+    for (int i = 0; i < 2; ++i) {
+        episodes[i].trajectory = {{0, 0}, {1}, {1.0f + 2 * static_cast<float>(i)}, false, {}, {}};
+        relabel(episodes[i].trajectory, 2, 1, 1);
+    }
+    const int out = dup(1), file = open((scratch / "out").c_str(), O_WRONLY | O_CREAT, 0600);
+    std::fflush(stdout);
+    dup2(file, 1);
+    print_evaluation(tiny_settings("odt"), episodes, 1, 2);
+    std::fflush(stdout);
+    dup2(out, 1), close(out), close(file);
+    CHECK(read_file(scratch / "out").find("mean return 2 +- 1.4142135 over 2 episodes") != std::string::npos);
+}
+
+TEST(expected_updates_are_those_of_the_schedule) {
+    const Settings settings = default_settings("maze2d-umaze-v1", "odt", "reduced");  // 300 steps an episode
+    CHECK_EQUAL(expected_updates(settings), 20000 + 200000.0 / 300 * 300);
+    CHECK_EQUAL(expected_updates(default_settings("maze2d-umaze-v1", "dt", "small")), 12700.0);
+    CHECK(CheckpointTimer{0}.due() && !CheckpointTimer{100}.due());
+}
+
+// A replay buffer is loaded as it was saved, with the ends of its trajectories.
+TEST(a_checkpoint_keeps_how_trajectories_ended) {
+    Trajectory ended{{1}, {2}, {3}, true, {}, {}}, cut{{1}, {2}, {3}, false, {}, {}};
+    ReplayBuffer saved{1, 1, 0.9, 5}, loaded = saved;
+    for (Trajectory* trajectory : {&ended, &cut}) {
+        relabel(*trajectory, 1, 1, 0.9);
+        saved.add(*trajectory);
+    }
+    TensorFile file;
+    Saver saver{file};
+    visit_replay(saver, saved, 0);
+    Loader loader{file};
+    visit_replay(loader, loaded, 0);
+    CHECK(loaded.trajectories.at(0).terminated && !loaded.trajectories.at(1).terminated);
+    CHECK(loaded.trajectories[1].rewards == cut.rewards && loaded.ends == saved.ends);
 }
 
 // `eval` repeats the run's last evaluation, of a finished run and of an unfinished one; another seed has other starts.
