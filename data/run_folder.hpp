@@ -355,8 +355,8 @@ struct FolderLock : File {
     }
 };
 
-// A run that was stopped, or that kept its state, goes on with larger budgets: its state becomes a checkpoint. Its model
-// stays until the run is finished again. Errors: run.not_kept, run.folder.
+// A run that was stopped, or that kept its state, goes on with larger budgets: its state becomes a checkpoint. Its
+// model stays until the run is finished again. Errors: run.not_kept, run.folder.
 inline void go_on(const RunFolder& folder, const Settings& begun, const Settings& settings) {
     const bool kept = folder.has("kept.safetensors"), has_state = kept || folder.has("checkpoint.safetensors");
     require(has_state || !folder.has("finished"), "run.not_kept", folder.path,
