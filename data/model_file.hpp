@@ -150,10 +150,14 @@ inline void require_room(const TensorFile& file, const Settings& settings) {
             ": does not hold the ", weights, " weights and more that its settings call for");
 }
 
-// Returns the path of a model: `given` itself, or the model file of the run's folder `given`.
+// Returns the path of a model: `given` itself, or the model file of the run's folder `given`. Errors: model.unfinished
+// for the folder of a run that goes on, whose model file is of a smaller budget.
 inline std::string model_path(const std::string& given) {
     std::error_code error;  // of a name that no file can have
-    return std::filesystem::is_directory(given, error) ? given + "/model.safetensors" : given;
+    if (!std::filesystem::is_directory(given, error)) return given;
+    require(is_there(given + "/finished") || !is_there(given + "/checkpoint.safetensors"), "model.unfinished", given,
+            ": the run is unfinished; finish it, or name its file model.safetensors");
+    return given + "/model.safetensors";
 }
 
 // Errors: model.format, model.settings, safetensors.*, file.*.

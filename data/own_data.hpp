@@ -67,7 +67,8 @@ void print_held_out(const Run& run, const std::string& path, const HeldOut& held
 }
 
 // The offline phase on own data. Measures before the first update, and after each tenth of all updates; as in the other
-// phases, what is left to do follows from the state alone: progress.evaluations counts the rows.
+// phases, what is left to do follows from the state alone: progress.evaluations is the number of rows that were due at
+// the latest one, under the present budget.
 void fit_own_data(Run& run, const Observer& observer, const std::string& path) {
     const std::vector<Trajectory> held_out = part_of_own_data(run.agent.settings, true);
     if (held_out.empty()) std::fprintf(stderr, "%s: no trajectory is held out, so nothing is measured\n", path.c_str());
@@ -171,7 +172,7 @@ void act_on_lines(const Agent& agent, Tape<float>& acting, const std::string& pa
     Episode episode;
     std::string line;
     size_t number = 0;
-    while (std::getline(input, line) && !std::ferror(stdout)) {
+    while (!std::ferror(stdout) && std::getline(input, line)) {
         ++number;
         if (line.ends_with('\r')) line.pop_back();
         if (trimmed(line).empty()) {
@@ -193,5 +194,6 @@ void act_on_lines(const Agent& agent, Tape<float>& acting, const std::string& pa
         std::printf("%s", answer.c_str());
         std::fflush(stdout);
     }
-    require(!input.bad(), "file.read", "cannot read ", path.empty() ? "standard input" : path, " beyond line ", number);
+    const bool failed = input.bad() || (path.empty() && std::ferror(stdin) != 0);  // cin takes the latter for an end
+    require(!failed, "file.read", "cannot read ", path.empty() ? "standard input" : path, " beyond line ", number);
 }

@@ -868,6 +868,7 @@ inline void add_own_data(std::vector<Part>& parts, const Group&) {
 }
 
 // "Updates made, mean over seeds: ODT 42,000; WODTEM 143,000, 3.4 times those of ODT." and what follows from it.
+// Nothing for own data, or where there is one row.
 inline std::string updates_sentence(const Group& group) {
     if (group.any().own() || group.rows.size() < 2) return "";
     std::string out;
@@ -929,9 +930,9 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
 
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs, const std::string& out_folder) {
-    std::map<std::array<std::string, 4>, Runs> groups;
+    std::map<std::array<std::string, 3>, Runs> groups;
     for (const Run& run : runs)
-        groups[{data_name(run.settings), run.settings.preset, run.settings.physics, run.settings.task}].push_back(&run);
+        groups[{data_name(run.settings), run.settings.preset, run.settings.physics}].push_back(&run);
     const char* const numbers =
         "One section for each task, preset and physics. Runs with equal settings but for the seed are averaged; "
         "others stand apart, and a label in parentheses names the settings that differ from the preset and from other "

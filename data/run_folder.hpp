@@ -272,10 +272,9 @@ struct SecondsLog {
             text = "updates,interactions,seconds,date,machine,program\n";
         } else {
             const std::vector<std::string> fields = split(lines[lines.size() - 2], ',');
-            const std::optional<double> seconds = fields.size() == 6 ? to_number(fields[2]) : std::nullopt;
-            require(seconds && *seconds >= 0 && *seconds < 1e12, "run.seconds", path,
+            before = fields.size() == 6 ? to_number(fields[2]).value_or(-1) : -1;
+            require(before >= 0 && before < 1e12, "run.seconds", path,
                     ": its last line has no seconds; remove the file, which only the report's durations come from");
-            before = *seconds;
         }
         write_file_atomic(path, text);
         began = Clock::now();
@@ -342,6 +341,13 @@ inline void rename_file(const std::string& from, const std::string& to) {
     require(!problem, "run.folder", "cannot rename ", from, " to ", to, ": ", problem.message());
 }
 
+// A file that is not there is none to remove. Errors: run.folder.
+inline void remove_file(const std::string& path) {
+    std::error_code problem;
+    std::filesystem::remove(path, problem);
+    require(!problem, "run.folder", "cannot remove ", path, ": ", problem.message());
+}
+
 // Keeps other processes out of a folder for as long as it lives; the system releases it however the process ends.
 // Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
 struct FolderLock : File {
@@ -361,8 +367,8 @@ inline void go_on(const RunFolder& folder, const Settings& begun, const Settings
     const bool kept = folder.has("kept.safetensors"), has_state = kept || folder.has("checkpoint.safetensors");
     require(has_state || !folder.has("finished"), "run.not_kept", folder.path,
             " is finished and has not kept its state; train with --keep-state to go on with a larger budget later");
+    remove_file(folder.file("finished"));
     if (kept) rename_file(folder.file("kept.safetensors"), folder.file("checkpoint.safetensors"));
-    std::filesystem::remove(folder.file("finished"));
     const std::string line =
         text_of("offline_updates = ", begun.offline_updates, ", online_steps = ", begun.online_steps, "\n");
     const std::string path = folder.file("budgets"), before = folder.has("budgets") ? read_file(path) : "";
@@ -453,7 +459,7 @@ inline void retire_checkpoint(const RunFolder& folder, bool keep) {
     if (keep)
         rename_file(folder.file("checkpoint.safetensors"), folder.file("kept.safetensors"));
     else
-        std::filesystem::remove(folder.file("checkpoint.safetensors"));
+        remove_file(folder.file("checkpoint.safetensors"));
 }
 
 // Says so if the run is finished, and retires a checkpoint that a kill has left beside the model.

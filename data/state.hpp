@@ -169,7 +169,7 @@ void check_state(auto& run) {
     const uint64_t due = offline + p.episodes * each;
     require_entry(p.updates <= due && (!online || p.updates >= due - (p.episodes > 0 ? each : 0)), "progress.updates",
                   "does not fit progress.episodes");
-    const bool own = settings.state_dim > 0;  // own data, whose measurements are counted: see fit_own_data()
+    const bool own = settings.state_dim > 0;  // own data, whose rows follow from the updates
     const uint64_t most_evaluations = own ? p.updates + 1 : online ? 1 + p.episodes / every : 0;
     require_entry(p.evaluations <= most_evaluations && (!online || p.evaluations >= 1), "progress.evaluations",
                   "does not fit progress.episodes");
