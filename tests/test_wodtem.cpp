@@ -934,7 +934,7 @@ TEST(a_run_killed_at_any_moment_ends_with_the_same_bytes) {
     quiet_train(tiny_settings("wodtem"), scratch / "whole");
     const Random random = {test_seed(), Stream::data_set};
     int kills = 0;
-    for (uint32_t attempt = 0; !fs::exists(scratch / "killed/finished") && attempt < 400; ++attempt) {
+    for (uint32_t attempt = 0; !fs::exists(scratch / "killed/finished") && attempt < 2000; ++attempt) {
         const pid_t child = fork();
         if (child == 0) {
             quiet_train(tiny_settings("wodtem"), scratch / "killed", 1 + static_cast<int>(attempt % 2), 0);
@@ -1109,6 +1109,11 @@ TEST(expected_updates_are_those_of_the_schedule) {
     CHECK_EQUAL(expected_updates(settings), 20000 + 200000.0 / 300 * 300);
     CHECK_EQUAL(expected_updates(default_settings("maze2d-umaze-v1", "dt", "small")), 12700.0);
     CHECK(CheckpointTimer{0}.due() && !CheckpointTimer{100}.due());
+    StoredModel model{tiny_settings("odt")};
+    ModelContents contents = model.contents();
+    contents.evaluations = 4;
+    model.settings.eval_episodes = 3;
+    CHECK_EQUAL(first_of_last_evaluation(contents, model.settings), 9u);
 }
 
 // A replay buffer is loaded as it was saved, with the ends of its trajectories.
