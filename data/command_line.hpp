@@ -42,12 +42,11 @@ inline const Option option_table[] = {
      "begin with a model's network, temperature and normaliser, not with random ones"},
     {"train", "--out", "DIR", "", "the run's folder (default: runs/TASK-PRESET-METHOD-SEED)"},
     {"train", "--checkpoint-every", "SECONDS", "30", "how much work a kill may cost; 0: save after each update"},
-    {"act", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
     {"train", "--keep-state", nullptr, "",
      "so that a finished run can go on with more online_steps or offline_updates"},
     {"eval", "--episodes", "N", "", "episodes (default: as many as the run's evaluations have)"},
     {"eval", "--seed", "N", "", "of the starts (default: the starts of the run's last evaluation)"},
-    {"eval", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
+    {"eval act", "--set", "NAME=VALUE", "", "g_eval or eval_context; may be repeated"},
     {"eval", "--record", "FILE", "", "write the episodes there, as a data set in D4RL's layout"},
     {"export", "--odt", nullptr, "",
      "for load_state_dict(strict=True) of ODT's own code: its names, its unused tensors"},
@@ -369,21 +368,29 @@ inline bool is_data_file(const std::string& task) {
     return !is_task && (named || is_there(task));
 }
 
+// What a task, or the path of own data in its place, makes the settings before --set. Errors: usage.*, and for own data
+// those of load_own_data().
+inline Settings chosen_settings(const Arguments& arguments, const std::string& task, const std::string& method) {
+    const bool own = is_data_file(task);
+    if (own && arguments.has("--dataset"))
+        fail("usage.option", "two data sets are given; to train on one of them for a task, name the task first");
+    Settings settings = default_settings(own ? own_data : task, method, arguments["--preset"]);
+    if (arguments.has("--clip-actions")) set_from(settings, "clip_actions", "yes", "command line");
+    if (own) choose_own_data(settings, task);
+    return settings;
+}
+
 // The settings of one run but for its seed, for the options that train and import share. Errors: usage.*,
 // dataset.missing.
 inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method) {
-    const bool own = is_data_file(task);
-    Settings settings = default_settings(own ? own_data : task, method, arguments["--preset"]);
+    Settings settings = chosen_settings(arguments, task, method);
     if (find_mujoco_task(settings.task)) {
         settings.mujoco = mujoco_version();
         choose_data_set(settings, arguments["--dataset"]);
     } else if (arguments.has("--dataset")) {
-        fail("usage.option", own ? "two data sets are given; to train on one of them for a task, name the task first"
-                                 : "the grid world makes its own data set; leave --dataset out");
+        fail("usage.option", "the grid world makes its own data set; leave --dataset out");
     }
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
-    if (arguments.has("--clip-actions")) set_from(settings, "clip_actions", "yes", "command line");
-    if (own) choose_own_data(settings, task);
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
     settings.arithmetic = kernel_of(arguments).arithmetic;
@@ -465,8 +472,9 @@ inline void announce(const PlannedRun& run) {
     const std::string data = settings.task == "gridworld" ? "made on the spot"
                              : settings.dataset == "none" ? "none (random actions)"
                                                           : settings.dataset;
-    std::fprintf(stderr, "%s: task %s, preset %s, data set %s, folder %s (its file settings has all the rest)\n",
-                 run.label.c_str(), settings.task.c_str(), settings.preset.c_str(), data.c_str(), run.folder.c_str());
+    std::fprintf(stderr, "%s: task %s, preset %s, data set %s, folder %s; all settings: %s/settings\n",
+                 run.label.c_str(), settings.task.c_str(), settings.preset.c_str(), data.c_str(), run.folder.c_str(),
+                 run.folder.c_str());
 }
 
 // One for each method of a sweep, all checked but for a task's data set, which its machine must have. Errors: usage.*,
@@ -475,11 +483,7 @@ inline std::vector<Settings> swept_settings(const Arguments& arguments) {
     std::vector<Settings> sweep;
     for (const std::string& method : split(arguments["--methods"], ',')) {
         const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
-        const bool own = is_data_file(task);
-        if (own && arguments.has("--dataset")) fail("usage.option", "two data sets are given; leave --dataset out");
-        sweep.push_back(default_settings(own ? own_data : task, method, arguments["--preset"]));
-        if (arguments.has("--clip-actions")) set_from(sweep.back(), "clip_actions", "yes", "command line");
-        if (own) choose_own_data(sweep.back(), task);
+        sweep.push_back(chosen_settings(arguments, task, method));
         apply_assignments(sweep.back(), arguments.assignments);
         check_together(sweep.back());
     }

@@ -97,9 +97,9 @@ inline std::string data_set_file(const std::string& given) {
     std::error_code error;  // of a name that no file can have
     if (!std::filesystem::is_directory(given, error)) return given;
     for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
-        if (std::filesystem::exists(given + file)) return given + file;
+        if (is_there(given + file)) return given + file;
     for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow"})
-        require(!std::filesystem::exists(given + file), "dataset.arrow", given,
+        require(!is_there(given + file), "dataset.arrow", given,
                 ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
     return given;
 }
@@ -544,7 +544,15 @@ inline std::string remark_on_bodies(const Rows& rows, const MujocoTask& task, co
     return "";
 }
 
-// Returns what a user should know of a data set before training on it under these physics, a sentence each.
+// A sentence about rows_outside(), for users; "" if there are none.
+inline std::string remark_on_places(const Rows& rows, const MujocoTask& task, const std::vector<size_t>& outside) {
+    if (outside.empty()) return "";
+    return text_of(outside.size(), " of ", rows.count, " positions lie in no free cell of ", task.name,
+                   ", first in row ", outside[0], ": is it of another maze, or PointMaze's in coordinates of its own? ",
+                   "Minari's own file of it is read in the right ones");
+}
+
+// Returns what else a user should know of a data set before training on it under these physics, a sentence each.
 inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& task, const std::string& physics) {
     std::vector<std::string> remarks;
     if (!rows.read_as.empty()) remarks.push_back(rows.read_as);
@@ -559,11 +567,6 @@ inline std::vector<std::string> remarks_on(const Rows& rows, const MujocoTask& t
         remarks.push_back(
             "ant's contact forces (columns 27 to 110) are not 0, as they are in D4RL's data and in this "
             "program: a policy would learn from numbers that it will never see");
-    if (const std::vector<size_t> outside = rows_outside(rows, task); !outside.empty())
-        remarks.push_back(text_of(outside.size(), " of ", rows.count, " positions lie in no free cell of ", task.name,
-                                  ", first in row ", outside[0],
-                                  ": is it of another maze, or PointMaze's in coordinates of "
-                                  "its own? Minari's own file of it is read in the right ones"));
     return remarks;
 }
 
@@ -579,7 +582,7 @@ inline void clip_actions(Rows& rows, const std::string& path) {
                  rows.actions.size());
 }
 
-// The file's trajectories for a task, without returns; what remarks_on() says goes to stderr. Of the settings it heeds
+// The file's trajectories for a task, without returns; what is to be remarked goes to stderr. Of the settings it heeds
 // cut (flags: where the file says so; else at the time limit, as in a file without timeouts, and at terminals),
 // clip_actions and physics. Errors: dataset.*, hdf5.*, file.*; dataset.place if more than one position in a hundred is
 // outside the maze.
@@ -590,9 +593,11 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
     if (settings.clip_actions) clip_actions(rows, path);
     std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     require_sound(rows, path);
-    const std::vector<std::string> remarks = remarks_on(rows, task, settings.physics);
-    if (rows_outside(rows, task).size() * 100 > rows.count)
-        throw Error("dataset.place", path + ": " + remarks.back());  // which is about them
+    const std::vector<size_t> outside = rows_outside(rows, task);
+    const std::string places = remark_on_places(rows, task, outside);
+    if (outside.size() * 100 > rows.count) throw Error("dataset.place", path + ": " + places);
+    std::vector<std::string> remarks = remarks_on(rows, task, settings.physics);
+    if (!places.empty()) remarks.push_back(places);
     for (const std::string& remark : remarks) std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
     return trajectories;
 }

@@ -58,8 +58,11 @@ inline void print_data_set(const std::string& path, std::string id) {
             "physics %-4s %zu recorded steps taken again end %.2g from the recorded state (median), at most %.2g\n",
             physics_names[static_cast<size_t>(physics)], found.size(), found[found.size() / 2], found.back());
     }
-    if (task)
+    if (task) {
+        const std::string places = remark_on_places(rows, *task, rows_outside(rows, *task));
+        if (!places.empty()) std::printf("note: %s\n", places.c_str());
         for (const std::string& remark : remarks_on(rows, *task, "d4rl")) std::printf("note: %s\n", remark.c_str());
+    }
     print_published(find_published(id));
 }
 

@@ -56,6 +56,7 @@ void hdf5(const std::string& input) {
             const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, "input");
             require_sound(rows, "input");
             describe(statistics_of(rows, trajectories));
+            remark_on_places(rows, task, rows_outside(rows, task));
             remarks_on(rows, task, "d4rl");
         } catch (const Error&) {
         }
