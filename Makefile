@@ -31,8 +31,9 @@ LIBRARIES = $(shell $(CXX) -E -x c++ -include mujoco/mujoco.h /dev/null >/dev/nu
 TESTS = $(patsubst tests/%.cpp,%,tests/main.cpp $(wildcard tests/test_*.cpp))
 SOURCES = $(wildcard *.hpp *.cpp data/*.hpp tests/*.hpp tests/*.cpp)
 
+# -flto=auto: one source file, but its functions are compiled by as many processes as there are cores.
 wodtem: wodtem.cpp $(HEADERS) | packages
-	$(CXX) $(CXXFLAGS) $< -o $@ $(LIBRARIES)
+	$(CXX) $(CXXFLAGS) -flto=auto $< -o $@ $(LIBRARIES)
 
 # A fresh Debian has apt and make alone. Without g++ nothing can be built, without MuJoCo everything but its tasks. What
 # is about to be installed is said first, with the command to do it by hand.
@@ -67,7 +68,11 @@ test: wodtem build/tests
 
 build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | packages
 	@mkdir -p build
-	$(CXX) $(CXXFLAGS) -O1 -fsanitize=address,undefined -fno-sanitize-recover=all -c $< -o $@
+	$(CXX) $(CXXFLAGS) -O1 -fsanitize=address,undefined -fno-sanitize-recover=all $(LESS) -c $< -o $@
+
+# The largest object takes two thirds of the time without checks of each pointer. An access through a null pointer, or
+# outside of an object, AddressSanitizer finds; nothing is virtual; what data/ reads is checked in the other objects.
+build/san-test_wodtem.o: LESS = -fno-sanitize=null,alignment,object-size,vptr
 
 build/tests-sanitized: $(TESTS:%=build/san-%.o)
 	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@ $(LIBRARIES)

@@ -166,8 +166,9 @@ inline std::string mujoco_version() { return mj_versionString(); }
 
 // Holds the bytes of a file in the binary: [name, name_end), followed by a zero. The compiler opens the path, from the
 // folder it runs in.
-#define WODTEM_EMBED(name, path)                                                                         \
-    asm(".pushsection .rodata\n" #name ": .incbin \"" path "\"\n" #name "_end: .byte 0\n.popsection\n"); \
+#define WODTEM_EMBED(name, path)                                                                        \
+    asm(".pushsection .rodata\n.weak " #name ", " #name "_end\n" #name ": .incbin \"" path "\"\n" #name \
+        "_end: .byte 0\n.popsection\n");                                                                \
     extern "C" const char name[], name##_end[];
 WODTEM_EMBED(wodtem_hopper_xml, "data/hopper.xml")
 WODTEM_EMBED(wodtem_walker2d_xml, "data/walker2d.xml")

@@ -87,6 +87,9 @@ struct Measurements {
 // ---------------------------------------------------------------------------------------------------------------------
 // Peaks: arithmetic in registers alone, and memory read from end to end.
 
+#pragma GCC push_options
+#pragma GCC optimize("O2")  // at the level of what is around it the sums would not stay in registers
+
 constexpr int burn_chains = 12;  // independent sums in flight: latency 4, two units, and some to spare
 
 template <class V, Multiply How>
@@ -150,6 +153,8 @@ EACH_TARGET float sum_of(const float* x, size_t n) {
     for (int i = 0; i < 64; ++i) sum += sums[i];
     return sum;
 }
+
+#pragma GCC pop_options
 
 // Bytes a second that `threads` read from memory beyond any cache.
 double bench_memory_bandwidth(Measurements& measured, int threads) {

@@ -1,4 +1,5 @@
-// main.cpp: runs every test, or those whose name contains an argument. `build/tests [--seed N] [part-of-a-name ...]`
+// main.cpp: runs every test, or those whose name contains an argument; --part 2/3: of these the second, fifth, ...
+//   build/tests [--seed N] [--part K/N] [part-of-a-name ...]
 #include <cstdlib>
 #include <cstring>
 
@@ -6,10 +7,14 @@
 
 int main(int argument_count, char** arguments) {
     std::vector<const char*> wanted;
+    unsigned part = 1, parts = 1, chosen = 0;
     for (int i = 1; i < argument_count; ++i) {
         if (std::strcmp(arguments[i], "--seed") == 0 && i + 1 < argument_count)
             test_seed() = static_cast<uint32_t>(std::strtoul(arguments[++i], nullptr, 10));
-        else
+        else if (std::strcmp(arguments[i], "--part") == 0 && i + 1 < argument_count) {
+            if (std::sscanf(arguments[++i], "%u/%u", &part, &parts) != 2 || part < 1 || part > parts)
+                return std::printf("--part takes K/N, 1 <= K <= N; got %s\n", arguments[i]), 2;
+        } else
             wanted.push_back(arguments[i]);
     }
     std::setvbuf(stdout, nullptr, _IOLBF, 0);
@@ -17,8 +22,8 @@ int main(int argument_count, char** arguments) {
     int passed = 0, failed = 0;
     for (const Test& test : all_tests()) {
         bool run = wanted.empty();
-        for (const char* part : wanted) run = run || std::strstr(test.name, part) != nullptr;
-        if (!run) continue;
+        for (const char* text : wanted) run = run || std::strstr(test.name, text) != nullptr;
+        if (!run || chosen++ % parts != part - 1) continue;
         failed_checks() = 0;
         try {
             test.run();
