@@ -425,9 +425,10 @@ struct Kernel {
     size_t panel_bytes(int lines, int depth) const { return size_t{4} * lines * divide_up(depth, k_a_word); }
 };
 
-// bf16 is the upper half of a float: 8 bits of mantissa, the leading one included. Rounds to nearest even; NaN stays.
+// bf16 is the upper half of a float: 8 bits of mantissa, the leading one included. Rounds to nearest even; NaN stays,
+// and subnormal numbers become 0, as in x86's conversions (Intel SDM, vcvtne2ps2bf16).
 ALWAYS_INLINE uint32_t to_bf16(float x) {
-    const uint32_t bits = std::bit_cast<uint32_t>(x);
+    const uint32_t bits = std::bit_cast<uint32_t>(std::abs(x) < 0x1p-126f ? std::copysign(0.0f, x) : x);
     return x == x ? (bits + 0x7fff + (bits >> 16 & 1)) >> 16 : bits >> 16 | 0x40;
 }
 
@@ -550,25 +551,65 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_line, 
     }
 }
 
+// Two numbers of successive k as a word: the even k in the lower half.
+ALWAYS_INLINE float bf16_word(float even, float odd) {
+    return std::bit_cast<float>(to_bf16(even) | to_bf16(odd) << 16);
+}
+
+#ifdef X86_KERNELS
+// both = to_bf16 of L + L numbers: first's, then second's.
+template <int L>
+ALWAYS_INLINE void to_bf16(Vector<uint16_t, 2 * L>& both, const float* first, const float* second) {
+    const Vector<float, L> low = lanes_at<L>(first), high = lanes_at<L>(second);
+    asm("vcvtne2ps2bf16 %1, %2, %0" : "=v"(both) : "v"(low), "v"(high));
+}
+#endif
+
+// words [pairs] of numbers [2 pairs] that lie side by side in order of k.
+template <Multiply How>
+ALWAYS_INLINE void bf16_words_along(float* words, const float* from, int pairs) {
+    int w = 0;
+#ifdef X86_KERNELS
+    if constexpr (How == Multiply::bf16)
+        for (; w + 16 <= pairs; w += 16) {
+            Vector<uint16_t, 32> both;
+            to_bf16<16>(both, from + 2 * w, from + 2 * w + 16);
+            lanes_at<16>(words + w) = reinterpret_cast<Vector<float, 16>>(both);
+        }
+#endif
+    for (; w < pairs; ++w) words[w] = bf16_word(from[2 * w], from[2 * w + 1]);
+}
+
+// words [n] of two rows [n], of an even k and the next.
+template <Multiply How, int L>
+ALWAYS_INLINE void bf16_words_across(float* words, const float* even, const float* odd, int n) {
+    int i = 0;
+#ifdef X86_KERNELS
+    if constexpr (How == Multiply::bf16)
+        for (; i + L <= n; i += L) {
+            Vector<uint16_t, 2 * L> both, order;
+            to_bf16<L>(both, even + i, odd + i);
+            for (int lane = 0; lane < 2 * L; ++lane)  // 0, L, 1, L + 1, ...
+                order[lane] = static_cast<uint16_t>(lane / 2 + lane % 2 * L);
+            lanes_at<L>(words + i) = reinterpret_cast<Vector<float, L>>(__builtin_shuffle(both, order));
+        }
+#endif
+    for (; i < n; ++i) words[i] = bf16_word(even[i], odd[i]);
+}
+
 // PackFunction for bf16: the panel is [depth / 2, Width] words, of k and k + 1; if depth is odd, the last has one zero.
-template <int Width>
+template <int Width, Multiply How>
 ALWAYS_INLINE void pack_bf16(void* to, View<const float> view, int first_k, int first_line, int depth, int used) {
-    const auto word = [](float even, float odd) { return std::bit_cast<float>(to_bf16(even) | to_bf16(odd) << 16); };
     const int pairs = depth / 2, words = divide_up(depth, 2), last = first_k + depth - 1;
     float buffer[sum_block / 2 * Width];  // words in the order of the view: [words, Width], or [Width, words]
     const ptrdiff_t per_word = view.transposed ? 1 : Width, per_line = view.transposed ? words : 1;
-    if (view.transposed)
-        for (int line = 0; line < used; ++line) {
-            const float* const from = &view(first_k, first_line + line);
-            for (int w = 0; w < pairs; ++w) buffer[line * words + w] = word(from[2 * w], from[2 * w + 1]);
-        }
-    else
-        for (int w = 0; w < pairs; ++w) {
-            const float *even = &view(first_k + 2 * w, first_line), *odd = &view(first_k + 2 * w + 1, first_line);
-            for (int line = 0; line < used; ++line) buffer[w * Width + line] = word(even[line], odd[line]);
-        }
+    for (int line = 0; view.transposed && line < used; ++line)
+        bf16_words_along<How>(buffer + line * words, &view(first_k, first_line + line), pairs);
+    for (int w = 0; !view.transposed && w < pairs; ++w)
+        bf16_words_across<How, Width % 16 ? 4 : 16>(buffer + w * Width, &view(first_k + 2 * w, first_line),
+                                                    &view(first_k + 2 * w + 1, first_line), used);
     for (int line = 0; pairs < words && line < used; ++line)
-        buffer[pairs * per_word + line * per_line] = word(view(last, first_line + line), 0);
+        buffer[pairs * per_word + line * per_line] = bf16_word(view(last, first_line + line), 0);
     pack_floats<Width>(to, {buffer, view.transposed ? words : Width, view.transposed}, 0, 0, words, used);
 }
 
@@ -600,9 +641,10 @@ __attribute__((target("arch=x86-64-v4,avx512bf16"))) inline void tile_avx512_bf1
     compute_tile<12, 2, 16, Multiply::bf16>(tile, a, b, depth);
 }
 template <int Width>
-__attribute__((target("arch=x86-64-v4"))) void pack_bf16_avx512(void* to, View<const float> view, int first_k,
-                                                                int first_line, int depth, int used) {
-    pack_bf16<Width>(to, view, first_k, first_line, depth, used);
+__attribute__((target("arch=x86-64-v4,avx512bf16"))) void pack_bf16_avx512(void* to, View<const float> view,
+                                                                           int first_k, int first_line, int depth,
+                                                                           int used) {
+    pack_bf16<Width, Multiply::bf16>(to, view, first_k, first_line, depth, used);
 }
 inline const Kernel kernel_avx512_bf16 = make_kernel<Multiply::bf16, 12, 32>(
     "avx512", [] { return has_avx512 && __builtin_cpu_supports("avx512bf16"); }, pack_bf16_avx512<12>,
@@ -618,7 +660,8 @@ inline void tile_portable_bf16(const Tile& tile, const void* a, const void* b, i
     compute_tile<4, 2, 4, Multiply::bf16_portable>(tile, a, b, depth);
 }
 inline const Kernel kernel_portable_bf16 = make_kernel<Multiply::bf16_portable, 4, 8>(
-    "portable", [] { return true; }, pack_bf16<4>, pack_bf16<8>, tile_portable_bf16);
+    "portable", [] { return true; }, pack_bf16<4, Multiply::bf16_portable>, pack_bf16<8, Multiply::bf16_portable>,
+    tile_portable_bf16);
 
 // All kernels of this program, of each precision the best first.
 inline const Kernel* const kernels[] = {
@@ -1609,6 +1652,12 @@ struct SequenceBatch {
     std::vector<float> actions;        // [n, action_dim]; those of each window's last step are not read
     std::vector<int> timesteps;        // [n]
     int steps() const { return static_cast<int>(returns_to_go.size()); }
+    void resize(size_t n, size_t state_dim, size_t action_dim) {
+        returns_to_go.resize(n);
+        states.resize(n * state_dim);
+        actions.resize(n * action_dim);
+        timesteps.resize(n);
+    }
 };
 
 enum class Queries { every_state, last_state };  // training learns from every step of a window; acting wants the last

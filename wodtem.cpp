@@ -175,25 +175,24 @@ void visit_state(Archive& archive, Run& run) {
 // Batches: from trajectories to what the network reads. Raw states index the memory; the network sees normalised ones.
 // What the memory adds to a batch, weights and advised actions, is constant in the backward pass.
 
-// Appends s [state_dim], normalised.
-void append_normalised(std::vector<float>& to, const Normaliser& normaliser, const float* state) {
+// to [state_dim] = s [state_dim], normalised.
+void normalise(float* to, const Normaliser& normaliser, const float* state) {
     for (size_t i = 0; i < normaliser.mean.size(); ++i)
-        to.push_back((state[i] - normaliser.mean[i]) / normaliser.deviation[i]);
+        to[i] = (state[i] - normaliser.mean[i]) / normaliser.deviation[i];
 }
 
 // Brings an action into the open interval (-1, 1), because atanh(1) is infinite. ODT's code.
 float clamp_action(float a) { return std::clamp(a, -1.0f + 1e-6f, 1.0f - 1e-6f); }
 
-// Appends an action as it enters a token: one-hot [discrete_actions], or clamped [action_dim].
-void append_action_token(std::vector<float>& to, const EnvironmentSpec& spec, const float* action) {
-    for (int i = 0; i < spec.discrete_actions; ++i) to.push_back(*action == static_cast<float>(i) ? 1.0f : 0.0f);
-    for (int i = 0; spec.discrete_actions == 0 && i < spec.action_dim; ++i) to.push_back(clamp_action(action[i]));
+// An action as it enters a token: to [discrete_actions], one-hot, or to [action_dim], clamped.
+void write_action_token(float* to, const EnvironmentSpec& spec, const float* action) {
+    for (int i = 0; i < spec.discrete_actions; ++i) to[i] = *action == static_cast<float>(i) ? 1.0f : 0.0f;
+    for (int i = 0; spec.discrete_actions == 0 && i < spec.action_dim; ++i) to[i] = clamp_action(action[i]);
 }
 
-// Appends an action [action_dim] as the likelihood takes it: an index, or clamped.
-void append_action(std::vector<float>& to, const EnvironmentSpec& spec, const float* action) {
-    for (int i = 0; i < spec.action_dim; ++i)
-        to.push_back(spec.discrete_actions > 0 ? action[i] : clamp_action(action[i]));
+// An action as the likelihood takes it: to [action_dim], an index, or clamped.
+void write_action(float* to, const EnvironmentSpec& spec, const float* action) {
+    for (int i = 0; i < spec.action_dim; ++i) to[i] = spec.discrete_actions > 0 ? action[i] : clamp_action(action[i]);
 }
 
 // Some windows of an update's batch: n steps, packed. c runs over the steps of a window, which are C^t of eqs. (2) and
@@ -213,20 +212,36 @@ struct Batch {
     double short_pairs = 0;                  // steps with d_c < e-hat
 };
 
-// Appends step t of a trajectory, whose returns are those of relabel(): they do not depend on the window.
-void append_step(Batch& batch, const Agent& agent, const Trajectory& trajectory, int t) {
-    const float* state = &trajectory.states[t * agent.spec.state_dim];
-    const float* action = &trajectory.actions[t * agent.spec.action_dim];
+// Writes step t of a trajectory, whose returns are those of relabel(): they do not depend on the window.
+void write_step(Batch& batch, size_t i, const Agent& agent, const Trajectory& trajectory, int t) {
+    const int S = agent.spec.state_dim, A = agent.spec.action_dim;
+    const float *state = &trajectory.states[t * S], *action = &trajectory.actions[t * A];
     // The network reads g_t times reward_scale. d_t stays in units of the reward: eqs. (5) and (7) compare it
     // with e, which is a d_t too, and eq. (6) takes exp(e) as it is.
     const double g = trajectory.returns_to_go[t] * agent.settings.reward_scale;
-    batch.sequences.returns_to_go.push_back(static_cast<float>(g));
-    append_normalised(batch.sequences.states, agent.normaliser, state);
-    append_action_token(batch.sequences.actions, agent.spec, action);
-    batch.sequences.timesteps.push_back(t);
-    append_action(batch.actions, agent.spec, action);
-    batch.discounted_returns.push_back(trajectory.discounted_returns[t]);
-    batch.raw_states.push_back(state);
+    batch.sequences.returns_to_go[i] = static_cast<float>(g);
+    normalise(&batch.sequences.states[i * S], agent.normaliser, state);
+    write_action_token(&batch.sequences.actions[i * agent.model.config.action_dim], agent.spec, action);
+    batch.sequences.timesteps[i] = t;
+    write_action(&batch.actions[i * A], agent.spec, action);
+    batch.discounted_returns[i] = trajectory.discounted_returns[t];
+    batch.raw_states[i] = state;
+}
+
+// What the network reads of these windows, and what their steps obtained; all but the batch's coefficients, weights and
+// random numbers.
+Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, std::span<const Window> windows) {
+    Batch batch;
+    size_t n = 0, i = 0;
+    for (const Window& window : windows) n += batch.sequences.lengths.emplace_back(window.length);
+    batch.sequences.resize(n, agent.spec.state_dim, agent.model.config.action_dim);
+    batch.actions.resize(n * agent.spec.action_dim);
+    batch.discounted_returns.resize(n);
+    batch.raw_states.resize(n);
+    for (const Window& window : windows)
+        for (int c = 0; c < window.length; ++c)
+            write_step(batch, i++, agent, trajectories[window.trajectory], window.start + c);
+    return batch;
 }
 
 // WODTEM sec. IV-B.3, step 1: sub-trajectories (s_{-C,t}, a_{-C,t}, g_{-C,t}, d_{-C,t}) from the replay buffer: windows
@@ -235,30 +250,28 @@ Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
     const Agent& agent = run.agent;
     const uint32_t context_length = static_cast<uint32_t>(agent.settings.context_length);
     const Draw draw = agent.settings.sampling == "uniform" ? Draw::uniform : Draw::by_length;
-    Batch batch;
-    for (uint32_t window = first; window < end; ++window) {
-        const Window at = run.replay.sample(agent.random(Stream::batch), run.progress.updates, window,
-                                            static_cast<int>(context_length), draw);
-        const Trajectory& trajectory = run.replay.trajectories[at.trajectory];
-        batch.sequences.lengths.push_back(at.length);
-        for (int c = 0; c < at.length; ++c) {
-            append_step(batch, agent, trajectory, at.start + c);
-            batch.coefficients.push_back(1.0 / static_cast<double>(agent.settings.batch_size * at.length));
+    std::vector<Window> windows;
+    for (uint32_t window = first; window < end; ++window)
+        windows.push_back(run.replay.sample(agent.random(Stream::batch), run.progress.updates, window,
+                                            static_cast<int>(context_length), draw));
+    Batch batch = batch_of(agent, run.replay.trajectories, windows);
+    for (uint32_t window = first; window < end; ++window)
+        for (int c = 0, length = windows[window - first].length; c < length; ++c) {
+            batch.coefficients.push_back(1.0 / static_cast<double>(agent.settings.batch_size * length));
             batch.random_index.push_back(window * context_length + static_cast<uint32_t>(c));
         }
-    }
     // Without a memory, or where it has nothing better: w = 1, and a-hat, whose weight is then 0, is a_c.
     batch.advised_actions = batch.actions;
     batch.weights.assign(batch.coefficients.size(), 1.0f);
     return batch;
 }
 
-// Appends the state by which the memory knows s [state_dim]: raw, or normalised if `keys` says so.
-void append_memory_key(std::vector<float>& to, const Agent& agent, const float* state) {
+// to [state_dim] = what the memory knows s [state_dim] by: s itself, or normalised if `keys` says so.
+void write_memory_key(float* to, const Agent& agent, const float* state) {
     if (agent.settings.keys == "normalized")
-        append_normalised(to, agent.normaliser, state);
+        normalise(to, agent.normaliser, state);
     else
-        to.insert(to.end(), state, state + agent.spec.state_dim);
+        std::copy_n(state, agent.spec.state_dim, to);
 }
 
 // WODTEM sec. IV-B.3, step 2: looks up each s_c in Q; weighs (s_c, a_c) by eq. (7) and, where it falls short, draws
@@ -268,8 +281,9 @@ void consult_memory(const Run& run, Batch& batch) {
     const Agent& agent = run.agent;
     if (!agent.uses_memory()) return;
     const Random random = agent.random(Stream::advised_action);
-    std::vector<float> keys;  // [n, state_dim]
-    for (const float* state : batch.raw_states) append_memory_key(keys, agent, state);
+    std::vector<float> keys(batch.raw_states.size() * agent.spec.state_dim);  // [n, state_dim]
+    for (size_t i = 0; i < batch.raw_states.size(); ++i)
+        write_memory_key(&keys[i * agent.spec.state_dim], agent, batch.raw_states[i]);
     batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
     for (size_t i = 0; i < batch.raw_states.size(); ++i) {
         const std::span<const Neighbour> found = batch.neighbours[i];
@@ -305,11 +319,10 @@ void count_lookups(Run& run, const Batch& batch) {
 // WODTEM sec. IV-B.1: the table takes in a trajectory by eq. (4), once, as soon as the trajectory is complete.
 void remember(Run& run, const Trajectory& trajectory) {
     if (!run.agent.uses_memory()) return;
-    std::vector<float> keys;  // [T, state_dim]
-    for (int t = 0; t < trajectory.length(); ++t)
-        append_memory_key(keys, run.agent, &trajectory.states[t * run.agent.spec.state_dim]);
     Trajectory keyed = trajectory;
-    keyed.states = std::move(keys);
+    const int S = run.agent.spec.state_dim;
+    for (int t = 0; t < trajectory.length(); ++t)
+        write_memory_key(&keyed.states[t * S], run.agent, &trajectory.states[t * S]);
     const EpisodicMemory::Changes changes = run.memory.update(keyed);
     run.tally.matched += static_cast<double>(changes.improved + changes.kept);
     run.tally.evicted += static_cast<double>(changes.evicted);
@@ -496,19 +509,22 @@ std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy
 // action yet; its token is never built.
 SequenceBatch acting_batch(const Agent& agent, std::span<Episode* const> running) {
     const int context = static_cast<int>(std::min(agent.settings.eval_context, agent.settings.context_length));
-    const std::vector<float> no_action(agent.spec.action_dim);
+    const int S = agent.spec.state_dim, A = agent.spec.action_dim, token = agent.model.config.action_dim;
+    const std::vector<float> no_action(A);
     SequenceBatch batch;
+    size_t n = 0, i = 0;
+    for (const Episode* episode : running)
+        n += batch.lengths.emplace_back(std::min(context, episode->trajectory.length() + 1));
+    batch.resize(n, S, token);
     for (const Episode* episode : running) {
         const Trajectory& past = episode->trajectory;
-        const int t = past.length(), first = std::max(0, t + 1 - context);
-        batch.lengths.push_back(t + 1 - first);
-        for (int c = first; c <= t; ++c) {
-            const float* state = c < t ? &past.states[c * agent.spec.state_dim] : episode->state.data();
-            const float* action = c < t ? &past.actions[c * agent.spec.action_dim] : no_action.data();
-            append_normalised(batch.states, agent.normaliser, state);
-            append_action_token(batch.actions, agent.spec, action);
-            batch.returns_to_go.push_back(episode->targets[c]);
-            batch.timesteps.push_back(c);
+        const int t = past.length();
+        for (int c = std::max(0, t + 1 - context); c <= t; ++c, ++i) {
+            const float* action = c < t ? &past.actions[c * A] : no_action.data();
+            normalise(&batch.states[i * S], agent.normaliser, c < t ? &past.states[c * S] : episode->state.data());
+            write_action_token(&batch.actions[i * token], agent.spec, action);
+            batch.returns_to_go[i] = episode->targets[c];
+            batch.timesteps[i] = c;
         }
     }
     return batch;

@@ -32,9 +32,11 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
     const FrozenWeights frozen(acting.compute);
     const int context = static_cast<int>(agent.settings.context_length);
     double log_probs = 0, errors = 0, steps = 0;
-    Batch batch;
-    const auto add_batch = [&] {
+    std::vector<Window> windows;
+    int waiting = 0;  // steps of `windows`
+    const auto measure_windows = [&] {
         acting.reset();
+        const Batch batch = batch_of(agent, trajectories, windows);
         const Policy<float> policy = forward(acting, agent.model, batch.sequences, Queries::every_state);
         const Tensor<float> log_p = log_prob(acting, policy, batch.actions.data());
         for (int i = 0; i < log_p.rows; ++i) {
@@ -43,18 +45,16 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
             errors += action_error(agent, action, &batch.actions[i * agent.spec.action_dim]);
             steps += 1;
         }
-        batch = {};
+        windows.clear();
+        waiting = 0;
     };
-    for (const Trajectory& trajectory : trajectories) {
-        for (int t = 0; t < trajectory.length(); ++t) {
-            if (t % context == 0) batch.sequences.lengths.push_back(0);
-            batch.sequences.lengths.back() += 1;
-            append_step(batch, agent, trajectory, t);
-            const bool window_ends = t % context == context - 1 || t + 1 == trajectory.length();
-            if (window_ends && batch.sequences.steps() >= 2048 / 3) add_batch();
+    for (size_t trajectory = 0; trajectory < trajectories.size(); ++trajectory)
+        for (int start = 0, T = trajectories[trajectory].length(); start < T; start += context) {
+            windows.push_back({trajectory, start, std::min(context, T - start)});
+            waiting += windows.back().length;
+            if (waiting >= 2048 / 3) measure_windows();
         }
-    }
-    if (batch.sequences.steps() > 0) add_batch();
+    if (waiting > 0) measure_windows();
     return steps > 0 ? HeldOut{log_probs / steps, errors / steps} : HeldOut{};
 }
 

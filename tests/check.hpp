@@ -1449,9 +1449,9 @@ void check_normalize(Case& c) {
     Trajectory trajectory;
     trajectory.states = states.values;
     const Normaliser normaliser = fit_normaliser({trajectory}, states.extent(1));
-    std::vector<float> normalised;
-    for (size_t row = 0; row < states.shape[0]; ++row)
-        append_normalised(normalised, normaliser, &states.values[row * states.shape[1]]);
+    std::vector<float> normalised(states.values.size());
+    for (size_t i = 0; i < normalised.size(); i += states.shape[1])
+        normalise(&normalised[i], normaliser, &states.values[i]);
     c.expect("mean", {states.shape[1]}, normaliser.mean);
     c.expect("deviation", {states.shape[1]}, normaliser.deviation);
     c.expect("normalised", states.shape, normalised, true);

@@ -411,10 +411,35 @@ TEST(bias_and_relu_are_applied_once_after_the_last_addition) {
 
 TEST(bf16_rounds_to_the_nearest_and_of_two_to_the_even_one) {
     const std::pair<float, uint32_t> cases[] = {
-        {1.0f, 0x3f80},        {0x1.01p0f, 0x3f80}, {0x1.03p0f, 0x3f82}, {0x1.0102p0f, 0x3f81}, {-0x1.03p0f, 0xbf82},
-        {0x1.ffp127f, 0x7f80}, {INFINITY, 0x7f80},  {0.0f, 0},           {-0.0f, 0x8000}};
+        {1.0f, 0x3f80},       {0x1.01p0f, 0x3f80},     {0x1.03p0f, 0x3f82}, {0x1.0102p0f, 0x3f81},
+        {-0x1.03p0f, 0xbf82}, {0x1.ffp127f, 0x7f80},   {INFINITY, 0x7f80},  {0.0f, 0},
+        {-0.0f, 0x8000},      {-0x1.fffp-127f, 0x8000}};
     for (const auto& [x, bits] : cases) CHECK_EQUAL(to_bf16(x), bits);
     CHECK(std::isnan(std::bit_cast<float>(to_bf16(std::bit_cast<float>(0x7f800001)) << 16)));
+}
+
+// The instruction that packs against the definition: every upper half of a float, with lower halves around the tie.
+TEST(numbers_are_packed_as_bf16_by_the_definition) {
+    constexpr int depth = 64, lines = 32;
+    for (const Kernel* kernel : kernels_of_this_machine()) {
+        if (kernel->precision != std::string("bf16")) continue;
+        for (const uint32_t low : {0u, 1u, 0x7fffu, 0x8000u, 0x8001u, 0xffffu})
+            for (uint32_t upper = 0; upper < 0x10000; upper += depth * lines) {
+                std::vector<float> x;  // [depth, lines]
+                for (uint32_t i = 0; i < depth * lines; ++i) x.push_back(std::bit_cast<float>((upper + i) << 16 | low));
+                for (const bool transposed : {false, true}) {
+                    const View<const float> view = {x.data(), transposed ? depth : lines, transposed};
+                    const int width = kernel->tile_rows;
+                    std::vector<uint16_t> panel(depth * width);  // [depth / 2, width, 2]
+                    kernel->pack_a(panel.data(), view, 0, 0, depth, width);
+                    int wrong = 0;
+                    for (int k = 0; k < depth; ++k)
+                        for (int line = 0; line < width; ++line)
+                            wrong += panel[(k / 2 * width + line) * 2 + k % 2] != to_bf16(view(k, line));
+                    CHECK_EQUAL(wrong, 0);
+                }
+            }
+    }
 }
 
 // vdpbf16ps against its definition, on all kinds of numbers: subnormal, zero, infinite, NaN, sums that cancel or

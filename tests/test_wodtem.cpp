@@ -480,9 +480,8 @@ TEST(normalised_states_have_mean_zero_and_deviation_one) {
     Fixture f(tiny_settings("odt"));
     double count = 0, sum[2] = {}, squares[2] = {};
     for (const Trajectory& trajectory : make_data_set(f.run.agent.settings)) {
-        std::vector<float> x;
-        for (size_t t = 0; t < static_cast<size_t>(trajectory.length()); ++t)
-            append_normalised(x, f.run.agent.normaliser, &trajectory.states[2 * t]);
+        std::vector<float> x(trajectory.states.size());
+        for (size_t i = 0; i < x.size(); i += 2) normalise(&x[i], f.run.agent.normaliser, &trajectory.states[i]);
         for (size_t i = 0; i < x.size(); ++i)
             sum[i % 2] += static_cast<double>(x[i]),
                 squares[i % 2] += static_cast<double>(x[i]) * static_cast<double>(x[i]);
@@ -868,9 +867,9 @@ TEST(acting_is_told_the_target_less_the_rewards_so_far) {
     CHECK(batch.lengths == (std::vector<int>{1, 2}));
     CHECK(batch.returns_to_go == (std::vector<float>{2, 2, 1.5f}));
     CHECK(batch.timesteps == (std::vector<int>{0, 1, 2}));
-    std::vector<float> expected;
-    for (const auto& state : {std::array{1.0f, 2.0f}, std::array{3.0f, 3.0f}, std::array{4.0f, 5.0f}})
-        append_normalised(expected, f.run.agent.normaliser, state.data());
+    const std::vector<float> raw = {1, 2, 3, 3, 4, 5};
+    std::vector<float> expected(raw.size());
+    for (size_t i = 0; i < raw.size(); i += 2) normalise(&expected[i], f.run.agent.normaliser, &raw[i]);
     CHECK(batch.states == expected);
     CHECK_EQUAL(batch.actions[8 + 1], 1.0f);  // the second window's first step made move 1
     const Trajectory played = roll_out(f.run, GridWorld{}, Act::sample, 2, 0, 1)[0].trajectory;
@@ -1259,10 +1258,8 @@ TEST(held_out_measurements_are_means_over_steps) {
         double log_probs = 0, errors = 0, steps = 0;
         for (const Trajectory& trajectory : trajectories)
             for (int first = 0; first < trajectory.length(); first += 3) {
-                Batch window;
-                for (int t = first; t < std::min(first + 3, trajectory.length()); ++t)
-                    append_step(window, run.agent, trajectory, t);
-                window.sequences.lengths = {window.sequences.steps()};
+                const Window at = {0, first, std::min(3, trajectory.length() - first)};
+                const Batch window = batch_of(run.agent, {trajectory}, {&at, 1});
                 run.acting.reset();
                 const Policy<float> policy =
                     forward(run.acting, run.agent.model, window.sequences, Queries::every_state);
