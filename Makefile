@@ -28,12 +28,14 @@ CXXFLAGS = -std=c++20 -O2 -fvect-cost-model=dynamic -fpeel-loops -funswitch-loop
 HEADERS = $(wildcard *.hpp data/*.hpp data/*.xml data/policies/* tests/*.hpp tests/fuzz.cpp)
 # Asked when it is needed, after `packages`.
 LIBRARIES = $(shell $(CXX) -E -x c++ -include mujoco/mujoco.h /dev/null >/dev/null 2>&1 && echo -lmujoco)
+# What --version and seconds.csv say; "-dirty" where the sources differ from the commit, nothing outside of a checkout.
+COMMIT = $(shell git describe --always --dirty --exclude '*' 2>/dev/null)
 TESTS = $(patsubst tests/%.cpp,%,tests/main.cpp $(wildcard tests/test_*.cpp))
 SOURCES = $(wildcard *.hpp *.cpp data/*.hpp tests/*.hpp tests/*.cpp)
 
 # -flto=auto: one source file, but its functions are compiled by as many processes as there are cores.
 wodtem: wodtem.cpp $(HEADERS) | packages
-	$(CXX) $(CXXFLAGS) -flto=auto $< -o $@ $(LIBRARIES)
+	$(CXX) $(CXXFLAGS) -flto=auto -DWODTEM_COMMIT='"$(COMMIT)"' $< -o $@ $(LIBRARIES)
 
 # A fresh Debian has apt and make alone. Without g++ nothing can be built, without MuJoCo everything but its tasks. What
 # is about to be installed is said first, with the command to do it by hand.

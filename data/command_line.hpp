@@ -145,10 +145,9 @@ inline void print_command_list(std::span<const Command> commands) {
     std::printf("\nwodtem COMMAND --help lists a command's options. Try: wodtem train gridworld --method wodtem\n");
 }
 
-// Which files this program reads and writes, and with what it was built.
+// Which sources this program is of, which files it reads and writes, and with what it was built.
 inline void print_version() {
-    std::printf("wodtem: %s, %s; MuJoCo %s; compiler %s\n", model_format, checkpoint_format, mujoco_version().c_str(),
-                __VERSION__);
+    std::printf("wodtem: %s; %s; MuJoCo %s\n", model_format, program_text().c_str(), mujoco_version().c_str());
 }
 
 inline void print_help(const Command& command) {

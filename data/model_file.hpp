@@ -107,6 +107,16 @@ inline void load_counts(ModelContents& model, const TensorFile& file) {
 
 inline constexpr const char* checkpoint_format = "wodtem checkpoint 2";  // of run_folder.hpp
 
+// "commit 1a2b3c4; wodtem checkpoint 2; g++ 12.2.0", as seconds.csv has it; no commas. The Makefile says which commit.
+inline std::string program_text() {
+#ifdef WODTEM_COMMIT
+    const std::string commit = WODTEM_COMMIT;
+#else
+    const std::string commit;
+#endif
+    return "commit " + (commit.empty() ? "unknown" : commit) + "; " + checkpoint_format + "; g++ " + __VERSION__;
+}
+
 // Reads the network of an unfinished run from its checkpoint. Errors: model.value, safetensors.*.
 inline void load_unfinished(ModelContents& model, const TensorFile& file) {
     const uint64_t state_dim = static_cast<uint64_t>(model.config.state_dim);

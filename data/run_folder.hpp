@@ -288,8 +288,7 @@ struct SecondsLog {
         char seconds[32], date[32];
         std::snprintf(seconds, sizeof seconds, "%.3f", elapsed);
         std::strftime(date, sizeof date, "%Y-%m-%dT%H:%M:%SZ", std::gmtime(&now));
-        AppendFile(path).write(csv_line(updates, interactions, seconds, date, machine,
-                                        std::string(checkpoint_format) + "; g++ " + __VERSION__));
+        AppendFile(path).write(csv_line(updates, interactions, seconds, date, machine, program_text()));
     }
 };
 

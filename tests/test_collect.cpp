@@ -495,6 +495,7 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
     // The stored network, given whole observations, says what the played one said of the actions taken.
     const std::vector<float> weights = file.read<float>(*file.find("metadata/policy/fc0/weight")),
                              log_probs = file.read<float>(*file.find("infos/action_log_probs"));
+    CHECK_EQUAL(file.find("infos/action_log_probs")->shape.size(), size_t{1});
     for (size_t unit = 0; unit < 256; ++unit)
         for (size_t i = 0; i < 111; ++i)
             CHECK_EQUAL(weights[111 * unit + i], i < 27 ? network.parameters[0].value[27 * unit + i] : 0.0f);
@@ -521,6 +522,27 @@ TEST(a_medium_set_has_d4rls_layout_and_a_policy_of_all_columns) {
             CHECK(std::equal(rows.observation(t + 1), rows.observation(t + 1) + 111, &rows.next_observations[111 * t]));
         if (ends) length = 0;
     }
+}
+
+// Uniformly random actions let the hopper fall at some step; where that is the last step allowed, it is a timeout.
+TEST(a_fall_at_the_last_step_allowed_is_a_timeout_alone) {
+    MujocoTask task = *find_mujoco_task("hopper-medium-v2");
+    const auto play_to_the_end = [&] {
+        LiveTask<float> hopper(task);
+        float state[11], action[3];
+        hopper.reset({test_seed(), Stream::environment}, 0, state);
+        const Random random{test_seed(), Stream::data_set};
+        for (uint32_t t = 0;; ++t) {
+            for (uint32_t i = 0; i < 3; ++i) action[i] = static_cast<float>(2 * random.uniform(t, i) - 1);
+            if (hopper.step(action, state).terminated) return hopper.rows;
+        }
+    };
+    const auto fallen = play_to_the_end();
+    CHECK(fallen.terminals.back() == 1 && fallen.timeouts.back() == 0);
+    task.max_episode_steps = static_cast<int>(fallen.rewards.size());
+    const auto cut = play_to_the_end();
+    CHECK_EQUAL(cut.rewards.size(), fallen.rewards.size());
+    CHECK(cut.terminals.back() == 0 && cut.timeouts.back() == 1);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

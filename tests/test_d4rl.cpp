@@ -488,6 +488,46 @@ TEST(rows_of_another_size_or_without_an_end_are_refused) {
     CHECK_EQUAL(cut_trajectories(made({1, 2}, {0, 1}, {}), tiny, "f").size(), size_t{1});
 }
 
+TEST(moves_are_whole_numbers_of_an_integer_type_or_with_one_above_one) {
+    Rows rows;
+    rows.action_dim = 1;
+    for (const auto& [actions, integers, moves] : {std::tuple<std::vector<float>, bool, int>{{0, 1, 0, 1}, false, 0},
+                                                   {{0, 1, 0, 1}, true, 2},
+                                                   {{0, 1, 2, 1}, false, 3},
+                                                   {{0, 1, 2.5f, 1}, false, 0}}) {
+        rows.actions = actions;
+        rows.integer_actions = integers;
+        CHECK_EQUAL(number_of_moves(rows, "f"), moves);
+    }
+    rows.actions = {-1, 2};
+    CHECK_FAILS("dataset.action", number_of_moves(rows, "f"));
+}
+
+TEST(the_data_of_the_grid_world_are_drawn_by_the_seed_of_the_data_alone) {
+    Settings settings = default_settings("gridworld", "odt", "small");
+    set_from(settings, "data_trajectories", "20", "command line");
+    const auto states = [&](long seed, const char* data_seed) {
+        settings.seed = seed;
+        set_from(settings, "data_seed", data_seed, "command line");
+        std::vector<float> all;
+        for (const Trajectory& trajectory : make_data_set(settings)) append_all(all, trajectory.states);
+        return all;
+    };
+    CHECK(states(0, "5") == states(1, "5"));
+    CHECK(states(0, "5") != states(0, "6"));
+}
+
+TEST(larger_budgets_are_those_of_the_phase_that_a_run_ends_with) {
+    Settings found = default_settings("gridworld", "odt", "small"), wanted = found;
+    found.offline_updates = 100, found.online_steps = 500;
+    wanted.offline_updates = 200, wanted.online_steps = 700;
+    const Settings online = with_larger_budgets(found, wanted);
+    CHECK(online.offline_updates == 100 && online.online_steps == 700);
+    found.online_steps = wanted.online_steps = 0;
+    CHECK_EQUAL(with_larger_budgets(found, wanted).offline_updates, 200);
+    CHECK_EQUAL(with_larger_budgets(wanted, found).offline_updates, 200);
+}
+
 // The setting came later: a file of before does not have it, and one of after only where it is yes.
 TEST(clipping_of_actions_is_a_setting_that_only_its_users_files_have) {
     Settings settings = default_settings("hopper-medium-v2", "wodtem", "small");

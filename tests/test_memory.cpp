@@ -701,6 +701,9 @@ TEST(neighbours_lie_strictly_within_epsilon) {
     memory.config.exclude_self = true;
     const float own = -0.25f;
     CHECK(entries_of(search(memory, &own)).empty());
+    const float two[] = {-0.25f, 0.75f};  // each query excludes its own entry
+    const Neighbourhoods both = memory.search(two, 2);
+    CHECK(entries_of({both[1].begin(), both[1].end()}) == (std::vector<uint32_t>{0, 1}));
     memory.config.exclude_self = false;
     CHECK(entries_of(search(memory, &own)) == std::vector<uint32_t>{2});
 }

@@ -183,6 +183,14 @@ TEST(length_five_counts_from_the_evaluation_after_which_it_never_left) {
     CHECK(std::isnan(kept_from(run_with({0, 100}, {5, none}, true), 5)));
 }
 
+TEST(the_shortest_path_is_one_that_reached_the_goal) {
+    Run run;
+    CHECK(std::isnan(shortest_met(run)));
+    run.episode_length = {9, 4, 7, 8};
+    run.episode_return = {1, 0, 1, 1};
+    CHECK_EQUAL(shortest_met(run), 7.0);
+}
+
 TEST(each_length_falls_into_the_bar_whose_label_says_so) {
     std::vector<double> counts(bar_labels.size(), 0);
     for (int length = 1; length <= 100; ++length) {

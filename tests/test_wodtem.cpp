@@ -1132,6 +1132,38 @@ TEST(a_checkpoint_keeps_how_trajectories_ended) {
     CHECK(loaded.trajectories[1].rewards == cut.rewards && loaded.ends == saved.ends);
 }
 
+// The sums for the log: a checkpoint keeps them, and each mean stands in the column that bears its name.
+TEST(a_checkpoint_keeps_each_sum_and_a_row_has_it_in_its_column) {
+    Tally saved;
+    saved.loss = 3, saved.entropy = 5, saved.gradient_norm = 7, saved.updates = 2;
+    saved.pairs = 4, saved.short_pairs = 1, saved.unmatched_pairs = 2;
+    saved.rollout_length = 80, saved.rollout_return = 88, saved.rollouts = 8;
+    saved.matched = 21, saved.evicted = 22, saved.dropped = 23, saved.advice = 9, saved.advice_distance = 11;
+    const Settings settings = tiny_settings("wodtem");
+    Fixture f(settings), g(settings);
+    f.run.tally = saved;
+    TensorFile file;
+    Saver saver{file};
+    visit_state(saver, f.run);
+    Loader loader{file};
+    visit_state(loader, g.run);
+    const ProgressRow row = {true, 101, 102, 103, 0.5, 0.25, 104, 105, 106, 107, g.run.tally};
+    std::string line = progress_line(row, settings);
+    line.erase(line.find_last_not_of('\n') + 1);
+    const std::vector<std::string> fields = split(line, ','), names = split(progress_header, ',');
+    const std::map<std::string, std::string> expected = {
+        {"phase", "online"},      {"updates", "101"},        {"interactions", "102"}, {"episodes", "103"},
+        {"learning_rate", "0.5"}, {"loss", "1.5"},           {"entropy", "2.5"},      {"lambda", "0.25"},
+        {"gradient_norm", "3.5"}, {"short", "0.25"},         {"unmatched", "0.5"},    {"memory", "104"},
+        {"eval_length", "105"},   {"eval_return", "106"},    {"eval_score", "107"},   {"rollout_length", "10"},
+        {"rollout_return", "11"}, {"matched", "21"},         {"evicted", "22"},       {"dropped", "23"},
+        {"advice", "4.5"},        {"advice_distance", "5.5"}};
+    size_t found = 0;
+    for (size_t i = 0; i < fields.size(); ++i)
+        if (expected.contains(names.at(i))) found += fields[i] == expected.at(names[i]);
+    CHECK_EQUAL(found, expected.size());
+}
+
 // `eval` repeats the run's last evaluation, of a finished run and of an unfinished one; another seed has other starts.
 TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
     const Scratch scratch;
@@ -1192,15 +1224,15 @@ Settings own_settings(const std::string& path, const std::string& method) {
     return settings;
 }
 
-// Continuous data: 6 trajectories of 5 steps, 2 state and 2 action numbers.
-std::string continuous_file(const Scratch& scratch) {
+// Continuous data: 6 trajectories of 5 steps, 2 state and 2 action numbers. Rewards are sevenths of `reward`.
+std::string continuous_file(const Scratch& scratch, float reward = 1) {
     std::vector<float> states, actions, rewards;
     std::vector<uint8_t> terminals;
     for (int i = 0; i < 30; ++i) {
         const float x = static_cast<float>(i % 7) / 7;
         states.insert(states.end(), {x, 1 - x});
         actions.insert(actions.end(), {x - 0.5f, 0.25f});
-        rewards.push_back(x);
+        rewards.push_back(x * reward);
         terminals.push_back(i % 5 == 4);
     }
     Hdf5Writer out(scratch / "continuous.hdf5");
@@ -1228,6 +1260,8 @@ TEST(own_data_decide_sizes_returns_and_what_is_held_out) {
     }
     CHECK_CLOSE(continuous.g_eval, best, 1e-6);
     CHECK_EQUAL(continuous.reward_scale, 1.0);
+    for (const auto& [reward, scale] : {std::pair{3.0f, 1.0}, {40.0f, 0.01}, {0.01f, 100.0}})
+        CHECK_EQUAL(own_settings(continuous_file(scratch, reward), "odt").reward_scale, scale);
     // A third of six: the third and the sixth.
     Settings third = continuous;
     third.held_out = 1.0 / 3 + 1e-12;
@@ -1429,6 +1463,14 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     CHECK_EQUAL(shell("printf '0,0\\n5,1,1\\n2,2\\n' | " + act).text,
                 shell("printf '1,0,0\\n5,1,1\\n5,2,2\\n' | " + act).text);
     check_shell(act + scratch / "absent", 1, "cannot open");
+    quiet_train(own_settings(continuous_file(scratch), "odt"),
+                scratch / "own");  // what came before counts, to its digits
+    const auto answers = [&](const std::string& lines) {
+        return split(shell("printf '" + lines + "' | ./wodtem act " + scratch / "own").text, '\n');
+    };
+    const std::vector<std::string> twice = answers("0,1\\n0.5,0\\n\\n0,1\\n0.5,0\\n");
+    CHECK(twice.size() == 5 && twice[2] == twice[0] && twice[3] == twice[1]);
+    CHECK(twice[1] != answers("0.5,0\\n")[0]);
     check_shell(act + "--set alpha=0.5", 2, "eval and act take --set");
 }
 
@@ -1807,6 +1849,7 @@ namespace {
 struct Faulty : Environment {
     uint64_t episode = 0;
     int steps = 0;
+    const char* fails_with = "environment.unstable";
     EnvironmentSpec spec() const override { return GridWorld{}.spec(); }
     void reset(const Random&, uint64_t number, float* state) override {
         episode = number;
@@ -1814,7 +1857,7 @@ struct Faulty : Environment {
         state[0] = state[1] = 0;
     }
     Step step(const float*, float* state) override {
-        if (++steps == 3 && episode % 2 == 1) fail("environment.unstable", "faulty: step 3: as agreed");
+        if (++steps == 3 && episode % 2 == 1) fail(fails_with, "faulty: step 3: as agreed");
         state[0] = static_cast<float>(steps);
         return {1, steps == 5};
     }
@@ -1859,6 +1902,122 @@ TEST(episodes_whose_simulation_breaks_down_are_counted_and_used_for_nothing) {
     const Evaluation none =
         evaluate(f.run.agent, f.run.acting, f.run.environments.first(), 1);  // episode 2^40 + 1, an odd number
     CHECK(std::isnan(none.mean_length) && std::isnan(none.mean_return));
+    Faulty other;
+    other.fails_with = "some.other";  // is no matter of one episode
+    CHECK_FAILS("some.other", roll_out(f.run, other, Act::sample, 2, 1, 1));
+}
+
+// Faulty's first two episodes make 5 and 3 steps.
+TEST(the_online_phase_ends_with_the_episode_that_reaches_the_budget) {
+    for (const auto& [budget, interactions] : {std::pair<const char*, uint64_t>{"8", 8}, {"9", 13}}) {
+        Settings settings = tiny_settings("odt");
+        set_setting(settings, "online_steps", budget);
+        Fixture f(settings);
+        f.run.environments = Environments(Faulty{}, 1);
+        int evaluations = 0;
+        Observer observer;
+        observer.dropped = [](const std::string&) {};
+        observer.played = [](const EpisodeRow&) {};
+        observer.pause = [](double) {};
+        observer.ending = [] {};
+        observer.evaluated = [&](const ProgressRow&, const Evaluation&) { ++evaluations; };
+        online_phase(f.run, observer);
+        CHECK_EQUAL(f.run.progress.interactions, interactions);
+        CHECK_EQUAL(f.run.progress.updates, 40 + 5 * f.run.progress.episodes);
+        CHECK_EQUAL(evaluations, 2);
+    }
+}
+
+// Another pass over the same contexts, step by step, makes the same choices of the numbers of Stream::exploration.
+TEST(a_rollout_explores_by_its_own_stream_of_random_numbers) {
+    Fixture f(tiny_settings("odt"));
+    const Trajectory played = roll_out(f.run, GridWorld{}, Act::sample, 2, 5, 1)[0].trajectory;
+    Episode again;
+    again.state = {played.states[0], played.states[1]};
+    for (int t = 0; t < played.length(); ++t) {
+        append_target(again, 2, f.run.agent.settings.reward_scale);
+        Episode* const running[] = {&again};
+        f.run.acting.reset();
+        const Policy<float> policy =
+            forward(f.run.acting, f.run.agent.model, acting_batch(f.run.agent, running), Queries::last_state);
+        const std::vector<float> action = choose_action(
+            f.run.agent, policy, 0, Act::sample, f.run.agent.random(Stream::exploration), 5, static_cast<uint32_t>(t));
+        CHECK_EQUAL(action[0], played.actions[t]);
+        again.trajectory.states.insert(again.trajectory.states.end(), again.state.begin(), again.state.end());
+        again.trajectory.actions.push_back(played.actions[t]);
+        again.trajectory.rewards.push_back(played.rewards[t]);
+        again.reward = played.rewards[t];
+        if (t + 1 < played.length()) again.state = {played.states[2 * t + 2], played.states[2 * t + 3]};
+    }
+}
+
+TEST(a_row_has_the_mean_gradient_norm_of_its_updates_and_the_entries_of_the_table) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "table_size", "10");
+    Fixture whole(settings), parted(settings);
+    update(whole.run);
+    update(whole.run);
+    double norms = 0;
+    for (int i = 0; i < 2; ++i) {
+        parted.run.tally = {};
+        parted.run.tally.advice_shift.resize(8);
+        update(parted.run);
+        CHECK(parted.run.tally.gradient_norm > 0);
+        norms += parted.run.tally.gradient_norm;
+    }
+    CHECK_EQUAL(whole.run.tally.gradient_norm, norms);
+    CHECK(whole.run.memory.insertions > 10);
+    CHECK_EQUAL(progress_row(whole.run).memory_size, size_t{10});
+}
+
+// The map of the policy is that of an evaluation's first step, target g_eval, in each cell.
+TEST(the_map_of_the_policy_is_what_an_evaluation_would_do_in_each_cell) {
+    Fixture f(tiny_settings("odt"));
+    for (int i = 0; i < 20; ++i) update(f.run);
+    const std::vector<std::vector<float>> map = policy_by_cell(f.run, GridWorld{});
+    for (int cell = 0; cell < grid_cells; ++cell) {
+        Episode episode;
+        episode.state = {static_cast<float>(cell / 6), static_cast<float>(cell % 6)};
+        episode.targets = {1};
+        Episode* const running[] = {&episode};
+        f.run.acting.reset();
+        const Policy<float> policy =
+            forward(f.run.acting, f.run.agent.model, acting_batch(f.run.agent, running), Queries::last_state);
+        for (size_t move = 0; move < 8; ++move)
+            CHECK_CLOSE(map[static_cast<size_t>(cell)][move], std::exp(policy.output.value[move]), 1e-6);
+    }
+}
+
+// Every state of D is in the table, under the key by which a batch looks for it.
+TEST(normalised_keys_find_the_states_that_the_table_took_in) {
+    Settings settings = tiny_settings("wodtem");
+    set_setting(settings, "keys", "normalized");
+    const Fixture f(settings);
+    Batch batch = sample_batch(f.run, 0, 32);
+    consult_memory(f.run, batch);
+    for (size_t i = 0; i < 32; ++i) {
+        CHECK_EQUAL(batch.neighbours[i].size(), size_t{1});
+        CHECK_EQUAL(batch.neighbours[i][0].distance, 0.0f);
+    }
+    CHECK_EQUAL(f.run.memory.projected[0], (0 - f.run.agent.normaliser.mean[0]) / f.run.agent.normaliser.deviation[0]);
+}
+
+TEST(a_model_says_how_many_interactions_updates_and_evaluations_made_it) {
+    const Scratch scratch;
+    const Settings settings = tiny_settings("odt");
+    quiet_train(settings, scratch / "run");
+    Fixture f(settings);
+    ModelContents contents = contents_of(f.run.agent);
+    load_model(contents, open_model(scratch / "run/model.safetensors"));
+    const Table progress = results::Log(scratch / "run/progress.csv").table;
+    CHECK_EQUAL(std::to_string(contents.updates), progress.rows.back()[1]);
+    CHECK_EQUAL(std::to_string(contents.interactions), progress.rows.back()[2]);
+    CHECK_EQUAL(contents.evaluations, progress.rows.size());
+    f.run.progress.evaluations = 77;
+    std::filesystem::create_directory(scratch / "unfinished");
+    f.save_checkpoint(scratch / "unfinished");
+    quietly([&] { load_model(contents, open_model_or_checkpoint(scratch / "unfinished")); });
+    CHECK_EQUAL(contents.evaluations, uint64_t{77});
 }
 
 #ifdef WODTEM_MUJOCO
@@ -1916,6 +2075,10 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     check_shell("./wodtem info " + data + " --task maze2d-umaze", 0,
                 "rows:         3000, 4 state and 2 action numbers");
     check_shell("./wodtem info " + data, 0, "no task");
+    const std::string named = scratch / "maze2d-umaze-sparse-v1.hdf5";  // a given task goes before the name
+    std::filesystem::copy_file(data, named);
+    check_shell("./wodtem info " + named, 0, "(maze2d-umaze)");
+    CHECK(shell("./wodtem info " + named + " --task maze2d-large").text.find("(maze2d-umaze)") == std::string::npos);
     Settings settings = tiny_mujoco_settings("maze2d-umaze-v1", "wodtem");
     set_setting(settings, "behaviour", "recorded");
     settings.dataset_path = data;
@@ -2335,7 +2498,8 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     check_shell("./wodtem help train", 0, "updates_per_iteration");
     check_shell("./wodtem train --help", 0, "width                    8 ");  // the value that would be used
     check_shell("./wodtem tasks gridworld --preset=paper", 0, "width = 512");
-    check_shell("./wodtem --version", 0, "wodtem model 1, wodtem checkpoint 2; MuJoCo");
+    check_shell("./wodtem --version", 0, "wodtem model 1; commit ");
+    check_shell("./wodtem --version", 0, "; wodtem checkpoint 2; g++ ");
     check_shell("./wodtem train gridworld --lr 0.1", 2,
                 "has no option \"--lr\" (wodtem train --help); a setting is given");
     check_shell("./wodtem reprot", 2, "the nearest is \"report\"");
