@@ -570,6 +570,7 @@ template <Multiply How>
 ALWAYS_INLINE void bf16_words_along(float* words, const float* from, int pairs) {
     int w = 0;
 #ifdef X86_KERNELS
+    // 32 numbers in order of k become 32 bf16 in order of k, which are 16 words as they lie.
     if constexpr (How == Multiply::bf16)
         for (; w + 16 <= pairs; w += 16) {
             Vector<uint16_t, 32> both;
@@ -580,11 +581,13 @@ ALWAYS_INLINE void bf16_words_along(float* words, const float* from, int pairs) 
     for (; w < pairs; ++w) words[w] = bf16_word(from[2 * w], from[2 * w + 1]);
 }
 
-// words [n] of two rows [n], of an even k and the next.
+// words [n] of two rows [n], of an even k and the next. L: how many at a time; it divides the
+// width of a panel, so that of a whole panel none is left over.
 template <Multiply How, int L>
 ALWAYS_INLINE void bf16_words_across(float* words, const float* even, const float* odd, int n) {
     int i = 0;
 #ifdef X86_KERNELS
+    // The L of the even row come before the L of the odd row; interleaved they are L words.
     if constexpr (How == Multiply::bf16)
         for (; i + L <= n; i += L) {
             Vector<uint16_t, 2 * L> both, order;
