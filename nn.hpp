@@ -581,8 +581,8 @@ ALWAYS_INLINE void bf16_words_along(float* words, const float* from, int pairs) 
     for (; w < pairs; ++w) words[w] = bf16_word(from[2 * w], from[2 * w + 1]);
 }
 
-// words [n] of two rows [n], of an even k and the next. L: how many at a time; it divides the
-// width of a panel, so that of a whole panel none is left over.
+// words [n] of two rows [n], of an even k and the next. L: how many at a time; it divides the width of a panel, so that
+// of a whole panel none is left over.
 template <Multiply How, int L>
 ALWAYS_INLINE void bf16_words_across(float* words, const float* even, const float* odd, int n) {
     int i = 0;

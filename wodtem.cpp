@@ -212,7 +212,7 @@ struct Batch {
     double short_pairs = 0;                  // steps with d_c < e-hat
 };
 
-// Writes step t of a trajectory, whose returns are those of relabel(): they do not depend on the window.
+// Step i of the batch is step t of a trajectory, whose returns, those of relabel(), do not depend on the window.
 void write_step(Batch& batch, size_t i, const Agent& agent, const Trajectory& trajectory, int t) {
     const int S = agent.spec.state_dim, A = agent.spec.action_dim;
     const float *state = &trajectory.states[t * S], *action = &trajectory.actions[t * A];

@@ -92,7 +92,7 @@ while read -r number name; do
         continue
     fi
     part=${name##*/}
-    timeout 600 build/tests "$part" > log 2>&1 && found=0 || found=$?
+    timeout 120 build/tests "$part" > log 2>&1 && found=0 || found=$?
     if ! grep -q FAILED log && [ $found -le 1 ]; then timeout 900 build/tests > log 2>&1 && found=0 || found=$?; fi
     if [ $found != 0 ]; then
         by_tests=$((by_tests + 1))

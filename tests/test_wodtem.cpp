@@ -1463,8 +1463,8 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     CHECK_EQUAL(shell("printf '0,0\\n5,1,1\\n2,2\\n' | " + act).text,
                 shell("printf '1,0,0\\n5,1,1\\n5,2,2\\n' | " + act).text);
     check_shell(act + scratch / "absent", 1, "cannot open");
-    quiet_train(own_settings(continuous_file(scratch), "odt"),
-                scratch / "own");  // what came before counts, to its digits
+    // A blank line begins an episode. A Gaussian's mean depends on all steps before it, so that nothing may be left.
+    quiet_train(own_settings(continuous_file(scratch), "odt"), scratch / "own");
     const auto answers = [&](const std::string& lines) {
         return split(shell("printf '" + lines + "' | ./wodtem act " + scratch / "own").text, '\n');
     };
