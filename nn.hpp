@@ -182,7 +182,7 @@ class Threads {
     Threads(const Threads&) = delete;
     Threads& operator=(const Threads&) = delete;
 
-    int count() const { return static_cast<int>(workers_.size()) + 1; }
+    int count() const { return pretended > 0 ? pretended : static_cast<int>(workers_.size()) + 1; }
 
     // Calls f(task, worker) once for each task in [0, tasks) and returns when all are done; 0 <= worker < count().
     // f must not call run() and must not throw: an exception that leaves it would end the process in a worker, and in
@@ -193,6 +193,7 @@ class Threads {
     template <class F>
     void run(int tasks, F&& f, bool serial = false) {
         if (serial || workers_.empty() || tasks < 2) {
+            if (rehearse && !serial && tasks > 1) return rehearse(tasks, std::ref(f));
             for (int task = 0; task < tasks; ++task) {
                 if (asked_to_stop && asked_to_stop()) fail_stopped();
                 f(task, 0);
@@ -217,6 +218,11 @@ class Threads {
 
     // Set where work may be abandoned; run() calls it before each task of the calling thread.
     std::function<bool()> asked_to_stop;
+
+    // For a forecast of one thread (`wodtem bench`): work is cut as for `pretended` threads, and rehearse() is handed
+    // each job that they would share; it calls f(task, 0) for every task, in any order.
+    int pretended = 0;
+    std::function<void(int tasks, const std::function<void(int, int)>& f)> rehearse;
 
   private:
     // Waits until condition() holds, but for some ten microseconds at most. To be woken by the system takes about as
@@ -822,14 +828,14 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
     const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4);
     const int row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
-    const int column_blocks = std::clamp(8 / row_blocks, 1, std::max(1, panels / 4));
+    const int column_blocks = std::clamp(std::max(8, 4 * threads) / row_blocks, 1, std::max(1, panels / 4));
 
     PackedWeights& weights = compute.packed_weights;
     PackedWeights::Entry* cached = nullptr;
     if (b.weight && weights.frozen) cached = &weights.entries[{b.data, b.stride, b.transposed, K, N}];
     Buffer& buffer = cached ? cached->panels : compute.packed_b;
     const bool packed_before = cached && cached->valid;
-    const int steps = divide_up(K, sum_block), panels_a_task = std::max(1, panels / 8);
+    const int steps = divide_up(K, sum_block), panels_a_task = std::max(1, panels / std::max(8, threads));
     const int tasks_a_step = divide_up(panels, panels_a_task);
     const size_t step_bytes = kernel.panel_bytes(panels * kernel.tile_columns, std::min(K, sum_block));
     char* const packed = buffer.room(step_bytes * steps);
@@ -1086,7 +1092,8 @@ T* gradient_of(Tensor<T> x) {
 // operations a row. Little work in all is done by the calling thread.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int block = std::max(1, std::min(divide_up(rows, 8), 1 + 100000 / std::max(1, work)));
+    const int pieces = std::max(8, compute.threads.count());
+    const int block = std::max(1, std::min(divide_up(rows, pieces), 1 + 100000 / std::max(1, work)));
     const bool serial = static_cast<double>(rows) * work < 2e4;
     const auto share = [&](int task, int worker) { f(task * block, std::min(rows, (task + 1) * block), worker); };
     compute.threads.run(divide_up(rows, block), share, serial);
@@ -1186,24 +1193,28 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation
     return linear(tape, x, affine, 0, affine.bias.columns, activation);
 }
 
-// to[to_rows[i]] += from[from_rows[i]] for i < count, row by row, of [n, d] each; a null list names rows 0, 1, ...
-// Backward: from's gradient at from_rows[i] += to's gradient at to_rows[i].
+// to[to_rows[i]] += from[from_rows[i]] for i < count, in that order, rows of d numbers; a null list names rows 0, 1, ...
+// Shared out by columns, since a row may be added to twice.
+template <class T>
+void add_rows(Compute& compute, T* to, const int* to_rows, const T* from, const int* from_rows, int count, int d) {
+    constexpr int group = 64;  // columns
+    for_rows(compute, divide_up(d, group), count * group, [=](int begin, int end, int) {
+        for (ptrdiff_t i = 0; i < count; ++i) {
+            T* const sum = to + (to_rows ? to_rows[i] : i) * d;
+            const T* const row = from + (from_rows ? from_rows[i] : i) * d;
+            for (int j = begin * group; j < std::min(d, end * group); ++j) sum[j] += row[j];
+        }
+    });
+}
+
+// add_rows of tensors [n, d]. Backward: from's gradient at from_rows[i] += to's gradient at to_rows[i].
 template <class T>
 void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows,
                        int count) {
-    const ptrdiff_t d = to.columns;
-    for (ptrdiff_t i = 0; i < count; ++i) {
-        T* const sum = to.value + (to_rows ? to_rows[i] : i) * d;
-        const T* const row = from.value + (from_rows ? from_rows[i] : i) * d;
-        for (ptrdiff_t j = 0; j < d; ++j) sum[j] += row[j];
-    }
-    tape.on_backward(to, [=] {
-        T* const gradient = gradient_of(from);
-        for (ptrdiff_t i = 0; i < count; ++i) {
-            T* const sum = gradient + (from_rows ? from_rows[i] : i) * d;
-            const T* const row = to.grad() + (to_rows ? to_rows[i] : i) * d;
-            for (ptrdiff_t j = 0; j < d; ++j) sum[j] += row[j];
-        }
+    Compute& compute = tape.compute;
+    add_rows<T>(compute, to.value, to_rows, from.value, from_rows, count, to.columns);
+    tape.on_backward(to, [=, &compute] {
+        add_rows<T>(compute, gradient_of(from), from_rows, to.grad(), to_rows, count, to.columns);
     });
 }
 

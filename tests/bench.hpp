@@ -349,15 +349,84 @@ void bench_update(Measurements& measured, const Kernel& kernel, int threads, con
     for (const size_t episodes : {size_t{1}, size_t{10}}) bench_acting(measured, run, episodes, rates);
 }
 
+// Seconds that `threads` take for the job: each takes the next task as soon as it is free.
+double shared_seconds(const std::vector<double>& tasks, int threads) {
+    std::vector<double> busy_until(static_cast<size_t>(threads));
+    for (const double seconds : tasks) *std::ranges::min_element(busy_until) += seconds;
+    return std::ranges::max(busy_until);
+}
+
+// Seconds of one update; those in tasks that threads would share, on one core and dealt out; jobs that these make.
+struct Forecast {
+    double alone = 0, in_tasks = 0, shared = INFINITY;
+    size_t jobs = 0;
+};
+
+Forecast rehearse(Run& run, int cores) {
+    Forecast forecast = {0, 0, 0, 0};
+    Threads& threads = run.compute.threads;
+    threads.pretended = cores;
+    threads.rehearse = [&](int tasks, const std::function<void(int, int)>& f) {
+        std::vector<double> seconds;
+        for (int task = 0; task < tasks; ++task) seconds.push_back(seconds_of([&] { f(task, 0); }));
+        forecast.in_tasks += std::accumulate(seconds.begin(), seconds.end(), 0.0);
+        forecast.shared += shared_seconds(seconds, cores);
+        ++forecast.jobs;
+    };
+    forecast.alone = seconds_of([&] { update(run); }) - forecast.in_tasks;
+    threads.pretended = 0, threads.rehearse = nullptr;
+    return forecast;
+}
+
+#ifdef WODTEM_MUJOCO
+
+// The gym network, on episodes that fill whole windows.
+Settings gym_settings() {
+    Settings settings = default_settings("halfcheetah-v2", "wodtem", "paper");
+    set_setting(settings, "behaviour", "random");
+    return settings;
+}
+
+// What an update of an eighth of the gym network's batch would take on more cores than there are: its work is cut as
+// for so many threads, each task timed alone, and each job's tasks dealt out. A job also costs what a job of nothing
+// costs two threads here. Left out: cores share caches and memory. The better of two: a neighbour may have the core.
+void bench_many_cores(Measurements& measured, const Kernel& kernel) {
+    Settings settings = gym_settings();
+    settings.batch_size /= 8;
+    Threads two(2);
+    const double meeting = timed(1001, [&] { two.run(2, [](int, int) {}); }).median;
+    Compute compute(kernel, 1);
+    Run run(compute, settings, *make_environment(settings));
+    begin_run(run, make_data_set(settings));
+    update(run);
+    for (const int cores : {8, 32, 64}) {
+        Forecast best;
+        for (int round = 0; round < 2; ++round) {
+            const Forecast one = rehearse(run, cores);
+            if (one.alone + one.shared < best.alone + best.shared) best = one;
+        }
+        const double meetings = meeting * static_cast<double>(best.jobs), all = best.alone + best.shared + meetings;
+        const double one_core = best.alone + best.in_tasks;
+        const std::string group = "an eighth of an update of the gym network on more cores, forecast, " + label(kernel);
+        measured.add({group, std::to_string(cores) + " cores", {all, all, all}});
+        if (measured.json) continue;
+        std::printf(
+            "    %.1f times as fast as one core, of whose work %.2f%% is not shared out; time goes to that (%.0f%%), "
+            "to waiting for a job's last task (%.0f%%) and to %zu meetings (%.0f%%)\n",
+            one_core / all, 100 * best.alone / one_core, 100 * best.alone / all,
+            100 * (best.shared - best.in_tasks / cores) / all, best.jobs, 100 * meetings / all);
+    }
+}
+
+#endif
+
 void bench_updates(Measurements& measured, const Kernel& kernel, int threads, const Rates& rates) {
     for (const char* preset : {"small", "paper"})
         bench_update(measured, kernel, threads, rates,
                      std::string(preset) == "small" ? "grid world, preset small" : "grid world, preset paper",
                      default_settings("gridworld", "wodtem", preset));
-#ifdef WODTEM_MUJOCO  // whose episodes fill whole windows
-    Settings gym = default_settings("halfcheetah-v2", "wodtem", "paper");
-    set_setting(gym, "behaviour", "random");
-    bench_update(measured, kernel, threads, rates, "halfcheetah, preset paper", gym);
+#ifdef WODTEM_MUJOCO
+    bench_update(measured, kernel, threads, rates, "halfcheetah, preset paper", gym_settings());
 #endif
 }
 
@@ -446,6 +515,9 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
     for (const Kernel* kernel : chosen) rates.push_back(bench_products(measured, *kernel, threads));
     bench_other_kernels(measured, *chosen[0], threads, bandwidth);
     for (size_t i = 0; i < chosen.size(); ++i) bench_updates(measured, *chosen[i], threads, {rates[i], bandwidth});
+#ifdef WODTEM_MUJOCO
+    bench_many_cores(measured, *chosen[0]);
+#endif
     rusage use{};
     getrusage(RUSAGE_SELF, &use);
     if (!json) std::printf("peak memory so far: %ld MB\n", use.ru_maxrss / 1024);
