@@ -611,10 +611,8 @@ inline std::string train_command(const Settings& settings) {
     add("--method", settings.method);
     add("--preset", settings.preset);
     add("--seed", std::to_string(settings.seed));
-    if (settings.physics != "none") {
-        add("--dataset", file == "none" ? "random" : file);
-        add("--physics", settings.physics);
-    }
+    if (settings.physics != "none") add("--dataset", file == "none" ? "random" : file);
+    if (source_of(settings, setting_row("physics")) == "command line") add("--physics", settings.physics);
     if (settings.first_weights != "none")
         add("--weights", settings.weights_path.empty() ? "model-of-sha256-" + settings.first_weights
                                                        : std::filesystem::absolute(settings.weights_path).string());
