@@ -18,7 +18,7 @@
 #include <set>
 #include <variant>
 
-#include "../nn.hpp"  // and with it the other standard headers
+#include "safetensors.hpp"  // and with it nn.hpp and the other standard headers
 
 // ---------------------------------------------------------------------------------------------------------------------
 // SVG elements. Coordinates are in user units, x to the right, y downwards.
@@ -66,10 +66,21 @@ inline std::string replaced(std::string text, char from, const std::string& to) 
     return text;
 }
 
-// Text for XML and HTML, outside of tags or in an attribute. XML 1.0 has no control characters: each becomes "?".
+// Text for pages, in UTF-8 and on one line: a control character, or each byte beyond ASCII if the text is no UTF-8, is
+// written as \xHH, between `before` and `after`.
+inline std::string visible(const std::string& text, const char* before = "", const char* after = "") {
+    const bool utf8 = is_utf8(text);
+    std::string out;
+    for (const char c : text) {
+        const bool shown = !is_control(c) && (utf8 || (c & 0x80) == 0);
+        out += shown ? std::string(1, c) : before + ("\\x" + hex8(static_cast<uint8_t>(c)).substr(6)) + after;
+    }
+    return out;
+}
+
+// Text for XML and HTML, outside of tags or in an attribute.
 inline std::string escaped(std::string text) {
-    for (char& c : text)
-        if (c >= 0 && c < 0x20 && c != '\n' && c != '\t') c = '?';
+    text = visible(text);
     for (const auto& [c, name] : {std::pair('&', "&amp;"), {'<', "&lt;"}, {'>', "&gt;"}, {'"', "&quot;"}})
         text = replaced(text, c, name);
     return text;
@@ -124,10 +135,14 @@ struct Key {
 };
 
 // The title with a smaller line below it, the marks, and the legend in as many rows as it needs, the first at height
-// `y`, on a white ground, which is wider than `w` where the titles are.
+// `y`, on a white ground. Titles that are too long for `w` are set in smaller type, and below 10 widen the ground.
 inline std::string picture(double w, double y, const std::string& title, const std::string& subtitle, std::string marks,
                            const std::vector<Key>& keys) {
-    w = std::max({w, 32 + text_width(title) * 17 / 13, 32 + text_width(subtitle) * 12 / 13});
+    const auto type_of = [room = 13 * (w - 32)](const std::string& line, double most) {
+        return std::clamp(room / text_width(line), 10.0, most);
+    };
+    const double title_type = type_of(title, 17), subtitle_type = type_of(subtitle, 12);
+    w = std::max({w, 32 + text_width(title) * title_type / 13, 32 + text_width(subtitle) * subtitle_type / 13});
     double x = 16;
     for (const Key& key : keys) {
         const double needed = 34 + text_width(key.label);
@@ -144,8 +159,9 @@ inline std::string picture(double w, double y, const std::string& title, const s
                        "\" role=\"img\" aria-label=\"" + escaped(title + (subtitle.empty() ? "" : "; " + subtitle)) +
                        "\" font-family=\"sans-serif\" font-size=\"13\" " + fill(ink),
                    "\n" + rectangle(0, 0, w, h, fill(white)) +
-                       text(16, 22, title, "font-size=\"17\" font-weight=\"bold\"") +
-                       (subtitle.empty() ? "" : text(16, 39, subtitle, "font-size=\"12\"")) + marks);
+                       text(16, 22, title, "font-size=\"" + number(title_type) + "\" font-weight=\"bold\"") +
+                       (subtitle.empty() ? "" : text(16, 39, subtitle, "font-size=\"" + number(subtitle_type) + "\"")) +
+                       marks);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -209,6 +225,7 @@ struct Chart {
     std::vector<Series> series = {};
     std::vector<Mark> marks = {};
     std::vector<double> covers = {};  // what the y axis covers beside the points, so that charts can be compared
+    bool cuts_outliers = false;       // the y axis leaves out outliers, which are drawn at its end
 
     bool bars() const { return !categories.empty(); }
 };
@@ -250,13 +267,26 @@ inline std::vector<Series> drawn_series(const Chart& chart) {
     return all;
 }
 
-// The axis covers the points, the marks and what else the chart asks for; of bars the zero too.
+// Values without those more than three times the distance of the quartiles beyond them (Tukey's outer fences).
+inline std::vector<double> without_outliers(std::vector<double> values) {
+    std::ranges::sort(values);
+    const double q1 = values[values.size() / 4], q3 = values[values.size() * 3 / 4], reach = 3 * (q3 - q1);
+    std::erase_if(values, [&](double value) { return reach > 0 && (value < q1 - reach || value > q3 + reach); });
+    return values;
+}
+
+// The axis covers the points, the marks and what else the chart asks for; of bars the zero too. Outliers are told for
+// each series by itself, so that none is left out as a whole.
 inline Axis y_axis(const Chart& chart, const std::vector<Series>& series) {
     std::vector<double> values = chart.covers;
     if (chart.bars()) values.push_back(0);
-    for (const Series& s : series)
+    for (const Series& s : series) {
+        std::vector<double> heights;
         for (const Line& line : s.lines)
-            for (const Point& point : line) values.push_back(point.y);
+            for (const Point& point : line) heights.push_back(point.y);
+        if (chart.cuts_outliers) heights = without_outliers(heights);
+        values.insert(values.end(), heights.begin(), heights.end());
+    }
     for (const Mark& mark : chart.marks) values.push_back(mark.value);
     std::erase_if(values, [](double value) { return !drawable(value); });
     if (values.empty()) return linear_axis(0, 1, 5, plot_bottom, plot_top);
@@ -301,9 +331,9 @@ inline std::string line_style(const Series& s, double thickness) {
     return stroke(s.colour, thickness) + (s.level ? " stroke-dasharray=\"7 5\"" : "");
 }
 
-// One series: each line thin, with a dot at every point while dots can be told apart, and their mean thick above them.
+// One series: each line thin, with a dot at every point if they lie apart on average, and their mean thick above them.
 inline void draw_lines(const Series& s, const Axis& x, const Axis& y, std::string& thin, std::string& thick) {
-    constexpr size_t most_dots = 120;
+    constexpr double apart = 12;
     const auto place = [&](const Point& p) { return point(x.at(p.x), y.at(p.y)); };
     for (const Line& line : s.lines) {
         std::string points, dots;  // a dot is a stroke of no length with round ends
@@ -311,8 +341,10 @@ inline void draw_lines(const Series& s, const Axis& x, const Axis& y, std::strin
             points += place(p);
             dots += (dots.empty() ? "" : "M ") + place(p) + "h 0 ";
         }
+        const double extent = x.at(line.back().x) - x.at(line.front().x);
+        const bool has_dots = !s.level && extent >= apart * static_cast<double>(line.size() - 1);
         if (s.lines.size() > 1) thin += path(points, line_style(s, 1) + " stroke-opacity=\"0.5\"");
-        if (!s.level && line.size() <= most_dots) thin += path(dots, stroke(s.colour, 5) + " stroke-linecap=\"round\"");
+        if (has_dots) thin += path(dots, stroke(s.colour, 5) + " stroke-linecap=\"round\"");
     }
     std::string points;
     for (const Point& p : mean_of(s.lines)) points += place(p);
@@ -369,7 +401,15 @@ inline std::string draw_chart(const Chart& chart) {
         column += 11;
         keys.push_back({diamond(13, 0, mark.colour), mark.label});
     }
-    return picture(width, plot_bottom + 72, chart.title, chart.subtitle, draw_axes(chart, x, y) + thin + thick + levels,
+    double low = y.low, high = y.high;
+    for (const Series& s : series)
+        for (const Line& line : s.lines)
+            for (const Point& p : line) low = std::min(low, p.y), high = std::max(high, p.y);
+    std::string subtitle = chart.subtitle;
+    for (const auto& [end, frame, word] : {std::tuple(low, y.low, "from "), {high, y.high, "up to "}})
+        if (std::fabs(end - frame) > 1e-6 * (y.high - y.low))
+            subtitle += "; beyond the frame: " + (word + grouped(end, std::fabs(end) < 10 ? 2 : 0));
+    return picture(width, plot_bottom + 72, chart.title, subtitle, draw_axes(chart, x, y) + thin + thick + levels,
                    keys);
 }
 
@@ -492,21 +532,22 @@ struct Section {
     std::string verdict = "";  // one sentence for the top of the page, or empty
 };
 
-// A path in a link: what has a meaning of its own there is written as a percent sign and its code.
-inline std::string url_of(std::string path) {
-    for (const char c : std::string("% #?&<>()\"")) {
+// A path in a link: what has a meaning of its own there, or is not ASCII, is written as a percent sign and its code.
+inline std::string url_of(const std::string& path) {
+    std::string url;
+    for (const char c : path) {
         char code[4];
-        std::snprintf(code, sizeof code, "%%%02X", static_cast<unsigned>(c));
-        path = svg::replaced(path, c, code);
+        std::snprintf(code, sizeof code, "%%%02X", static_cast<unsigned>(static_cast<uint8_t>(c)));
+        url += c <= ' ' || c > '~' || std::strchr("%#?&<>()\"\\", c) ? code : std::string(1, c);
     }
-    return path;
+    return url;
 }
 
 // One line of fields, filled up with spaces to the widths of their columns; the first is flush left.
 inline std::string markdown_row(const std::vector<std::string>& fields, const std::vector<size_t>& widths) {
     std::string out = "|";
     for (size_t i = 0; i < fields.size(); ++i) {
-        const std::string field = svg::replaced(fields[i], '|', "\\|");  // a bar would end the field
+        const std::string field = svg::replaced(svg::visible(fields[i]), '|', "\\|");  // a bar would end the field
         const std::string space(widths[i] - std::min(widths[i], svg::characters(field)), ' ');
         out += i == 0 ? " " + field + space + " |" : " " + space + field + " |";
     }
@@ -516,9 +557,9 @@ inline std::string markdown_row(const std::vector<std::string>& fields, const st
 // Parts as Markdown, which a terminal shows as well: tables are aligned, figures are links to their files.
 struct Markdown {
     std::string heading(int level, const std::string& text) const {
-        return std::string(static_cast<size_t>(level), '#') + " " + text + "\n\n";
+        return std::string(static_cast<size_t>(level), '#') + " " + (*this)(text);
     }
-    std::string operator()(const std::string& paragraph) const { return paragraph + "\n\n"; }
+    std::string operator()(const std::string& paragraph) const { return svg::visible(paragraph) + "\n\n"; }
     std::string operator()(const Table& table) const {
         std::vector<size_t> widths(table.header.size(), 3);
         std::vector<std::string> rule;
@@ -532,10 +573,10 @@ struct Markdown {
         return out + "\n";
     }
     std::string operator()(const Figure& figure) const {
-        return "![](" + url_of(figure.file) + ")\n\n" + figure.caption + "\n\n";
+        return "![](" + url_of(figure.file) + ")\n\n" + (*this)(figure.caption);
     }
     std::string operator()(const Files& files) const {
-        std::string out = files.label + ":";
+        std::string out = svg::visible(files.label) + ":";
         for (const std::string& name : files.names) out += " [" + name + "](" + url_of(files.folder + "/" + name) + ")";
         return out + "\n\n";
     }

@@ -569,7 +569,9 @@ TEST(numbers_and_text_are_written_for_xml_and_readers) {
     CHECK_EQUAL(svg::grouped(-999, 0), "\u2212999");
     CHECK_EQUAL(svg::grouped(-0.001, 2), "0.00");
     CHECK_EQUAL(svg::grouped(not_measured, 2), "-");
-    CHECK_EQUAL(svg::escaped("<a b=\"c\"> & \x01\u00e9"), "&lt;a b=&quot;c&quot;&gt; &amp; ?\u00e9");
+    CHECK_EQUAL(svg::escaped("<a b=\"c\"> & \x01\u00e9"), "&lt;a b=&quot;c&quot;&gt; &amp; \\x01\u00e9");
+    CHECK_EQUAL(svg::visible("a\n\u00e9"), "a\\x0a\u00e9");
+    CHECK_EQUAL(svg::visible("a\xff|\n", "<", ">"), "a<\\xff>|<\\x0a>");
     CHECK(!well_formed("<a>") && !well_formed("<a></b>") && !well_formed("a & b") && !well_formed("<a b=\"/>"));
 }
 
@@ -644,6 +646,29 @@ TEST(line_chart_leaves_out_what_is_no_number) {
     chart.series = {{"a", svg::blue, {{}}}};
     for (int i = 0; i < 121; ++i) chart.series[0].lines[0].push_back({static_cast<double>(i), 1});
     CHECK_EQUAL(count(svg::draw_chart(chart), "h 0 "), size_t{0});  // too many to be told apart
+    chart.series[0].lines[0].resize(20);
+    CHECK_EQUAL(count(svg::draw_chart(chart), "h 0 "), size_t{20});
+    chart.series.push_back({"b", svg::green, {{{0, 2}, {190, 2}}}});  // now they lie close together
+    CHECK_EQUAL(count(svg::draw_chart(chart), "h 0 "), size_t{2});
+}
+
+TEST(outliers_are_drawn_at_the_edge_of_the_frame_and_told) {
+    svg::Chart chart{"t", "s", "x", "y", {}, {{"a", svg::blue, {{}}}}};
+    for (int i = 0; i < 10; ++i)
+        chart.series[0].lines[0].push_back({static_cast<double>(i), i == 0 ? 617.4 : 10.0 - i});
+    CHECK_EQUAL(count(svg::draw_chart(chart), ">700<"), size_t{1});  // the axis
+    chart.cuts_outliers = true;
+    const std::string svg = svg::draw_chart(chart);
+    check_figure(svg);
+    CHECK_EQUAL(count(svg, ">s; beyond the frame: up to 617<"), size_t{1});
+    CHECK_EQUAL(count(svg, "\"M 65.86 50 134.1 80 "), size_t{1});  // on an axis of 0 to 10
+    // Another series is no outlier, however far it lies; nor is anything where most values are the same.
+    chart.series.push_back({"b", svg::green, {{{0, 900}, {9, 901}}}});
+    CHECK_EQUAL(count(svg::draw_chart(chart), ">1,000<"), size_t{1});
+    chart.series = {{"a", svg::blue, {{{0, -5}, {1, 1}, {2, 1}, {3, 1}, {4, 1}, {5, 1}}}}};
+    CHECK_EQUAL(count(svg::draw_chart(chart), "beyond"), size_t{0});
+    chart.series = {{"a", svg::blue, {{{0, -50}, {1, 1}, {2, 1}, {3, 1.5}, {4, 1.5}, {5, 1}}}}};
+    CHECK_EQUAL(count(svg::draw_chart(chart), ">s; beyond the frame: from \u221250<"), size_t{1});
 }
 
 TEST(line_chart_ends_with_the_data_and_places_points_by_hand) {
@@ -689,9 +714,11 @@ TEST(legend_begins_a_new_row_before_the_edge) {
     CHECK_EQUAL(count(svg, "translate(16 100 )") + count(svg, "translate(123.51 100 )"), size_t{2});
     CHECK_EQUAL(count(svg, "translate(16 124 )"), size_t{1});
     CHECK_EQUAL(count(svg, "viewBox=\"0 0 250 146 \""), size_t{1});
-    // A title makes the figure as wide as it needs: 32 + 17 * 0.61 * 30.
-    CHECK_EQUAL(count(svg::picture(250, 100, std::string(30, 't'), "", "", keys), "viewBox=\"0 0 343.1 122 \""),
-                size_t{1});
+    // A long title is set smaller, 218 / (0.61 * 30), and at 10 makes the figure wider: 32 + 10 * 0.61 * 40.
+    const std::string smaller = svg::picture(250, 100, std::string(30, 't'), "", "", keys);
+    CHECK_EQUAL(count(smaller, "viewBox=\"0 0 250 146 \""), size_t{1});
+    CHECK_EQUAL(count(smaller, "font-size=\"11.91\""), size_t{1});
+    CHECK_EQUAL(count(svg::picture(250, 100, std::string(40, 't'), "", "", {}), "viewBox=\"0 0 276 122 \""), size_t{1});
 }
 
 TEST(map_draws_one_arrow_per_action_on_filled_cells) {
@@ -755,4 +782,5 @@ TEST(pages_are_one_well_formed_file_and_aligned_markdown) {
                 "![](t.svg)\n\nc\n\n<run>: [x.csv](../a%20b%23/x.csv) [y](../a%20b%23/y)\n\n");
     CHECK_EQUAL(count(html, "&lt;run&gt;: <a href=\"../a%20b%23/x.csv\">x.csv</a> <a href="), size_t{1});
     CHECK_EQUAL(url_of("50%<\"(&)\">?"), "50%25%3C%22%28%26%29%22%3E%3F");
+    CHECK_EQUAL(url_of("\\\n\xff\u00e9"), "%5C%0A%FF%C3%A9");
 }
