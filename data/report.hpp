@@ -133,6 +133,7 @@ struct Run {
     std::array<std::vector<double>, 3> start_actions;     // learned, D_offline, D_online: [8] each, or empty
     std::vector<MazeEpisode> paths;                       // of the latest evaluation in a maze, or empty
     std::vector<std::string> time;                        // cells of time_table(), or empty
+    std::string time_error;                               // why they are dashes, or empty
     std::vector<std::string> files;                       // those to look at
 
     const Method& about_method() const { return methods[method]; }
@@ -153,7 +154,7 @@ using Summary = double (*)(const Run&, const Quantity& name);  // final_value or
 constexpr std::array result_columns{
     "eval_length",   "eval_return",    "eval_score",        "advice",        "advice_distance",
     "advice_shift",  "loss",           "entropy",           "lambda",        "short",
-    "gradient_norm", "rollout_return", "held_out_log_prob", "held_out_error"};
+    "gradient_norm", "rollout_return", "held_out_log_prob", "held_out_error"};  // squared_error: see read_run()
 
 // policy.csv: 36 rows, one for each cell, with a column for each move. Errors: csv.rows, csv.number.
 inline std::vector<MoveShares> read_policy(const Log& log) {
@@ -222,18 +223,19 @@ inline Identity identity_of(const Settings& settings) {
     return out;
 }
 
-// The folder itself if it is a run's, else the run folders directly below it, in any order. Errors: report.folder.
-inline std::vector<std::string> run_folders(const std::string& folder) {
-    const auto holds_run = [](const std::string& path) { return std::filesystem::exists(path + "/settings"); };
-    if (holds_run(folder)) return {folder};
+// The folder itself if it is a run's, else the run folders up to `levels` below it, in any order: --methods and --seeds
+// make METHOD/seed-N in --out. What is no folder has none. Errors: report.folder.
+inline std::vector<std::string> run_folders(const std::string& folder, int levels = 2) {
+    if (is_there(folder + "/settings")) return {folder};
     std::vector<std::string> found;
-    std::error_code error;  // of what is no folder: none is found
-    for (const auto& entry : std::filesystem::directory_iterator(folder, error))
-        if (holds_run(entry.path())) found.push_back(entry.path());
-    if (found.empty())
+    std::error_code error;
+    if (levels == 2 || (levels == 1 && !std::filesystem::is_symlink(folder, error)))  // a link may lead in a circle
+        for (const auto& entry : std::filesystem::directory_iterator(folder, error))
+            for (const std::string& run : run_folders(entry.path(), levels - 1)) found.push_back(run);
+    if (found.empty() && levels == 2)
         fail("report.folder",
-             "%s: is no run folder and has none directly below it: nowhere there is a file `settings`, which training "
-             "writes first",
+             "%s: is no run folder and has none one or two levels below it: nowhere there is a file `settings`, which "
+             "training writes first",
              folder.c_str());
     return found;
 }
@@ -241,15 +243,18 @@ inline std::vector<std::string> run_folders(const std::string& folder) {
 // All files of one run folder. Errors: report.setting, and those of settings_from_text() and Log.
 inline Run read_run(const std::string& folder) {
     const auto file = [&](const char* name) { return folder + "/" + name; };
-    const auto exists = [&](const char* name) { return std::filesystem::exists(file(name)); };
+    const auto exists = [&](const char* name) { return is_there(file(name)); };
     Run run;
     run.folder = folder;
     run.settings = settings_from_text(read_file(file("settings")), file("settings"));
     run.usual = default_settings(run.settings.task, run.settings.method, run.settings.preset);
-    for (const SettingRow& row : setting_rows)  // what own data decide is usual for them
-        if (run.own() && source_of(run.settings, row) != "command line")
+    for (const SettingRow& row : setting_rows)  // what own data decide is usual for them, but which data they are
+        if (run.own() && source_of(run.settings, row) != "command line" &&
+            row.field != Field(&Settings::dataset_sha256))
             set_setting(run.usual, row.name, setting_text(run.settings, row));
-    run.command = exists("command") ? split(read_file(file("command")), '\n')[0] : train_command(run.settings);
+    run.command = exists("command") ? read_file(file("command")) : train_command(run.settings);
+    if (run.command.ends_with('\n')) run.command.pop_back();
+    run.command = svg::visible(run.command, "'$'", "''");  // what it quotes is quoted again, as bash reads it
     run.identity = identity_of(run.settings);
     while (run.settings.method != methods[run.method].name) ++run.method;  // the settings hold none but these
     run.mujoco = find_mujoco_task(run.settings.task);
@@ -258,7 +263,12 @@ inline Run read_run(const std::string& folder) {
     run.finished = exists("finished");
     for (const char* name : {"settings", "command", "progress.csv", "episodes.csv", "seconds.csv"})
         if (exists(name)) run.files.emplace_back(name);
-    if (exists("seconds.csv")) run.time = read_seconds(Log(file("seconds.csv")));
+    try {
+        if (exists("seconds.csv")) run.time = read_seconds(Log(file("seconds.csv")));
+    } catch (const Error& error) {  // no result depends on it
+        run.time = {"", "-", "-", "-", "-", "-"};
+        run.time_error = error.what();
+    }
     if (run.finished || exists("progress.csv")) {  // a run that has just begun may not have its logs yet
         const Log log(file("progress.csv"));
         run.progress["interactions"] = log.counts("interactions");
@@ -267,6 +277,10 @@ inline Run read_run(const std::string& folder) {
             if (i < 3 || contains(log.table.header, result_columns[i]))
                 run.progress[result_columns[i]] = log.results(result_columns[i], i < 6 ? 1e12 : 1e300);
         if (!log.table.rows.empty()) run.so_far = run.progress["interactions"].back();
+    }
+    if (run.own() && run.offline_only() && run.settings.moves == 0) {  // its loss is a squared error, no likelihood
+        run.progress["squared_error"] = run.column("loss");
+        for (const char* likelihood : {"loss", "held_out_log_prob"}) run.progress.erase(likelihood);
     }
     if (!run.offline_only() && (run.finished || exists("episodes.csv"))) {
         const Log log(file("episodes.csv"));
@@ -305,9 +319,9 @@ inline Spread spread_of(std::vector<double> values) {
 }
 
 // "5.00 ± 0.00"; "5.00 ± -" for one value; "-" for none.
-inline std::string plus_minus(const Spread& spread) {
+inline std::string plus_minus(const Spread& spread, int decimals = 2) {
     if (spread.count == 0) return "-";
-    return svg::grouped(spread.mean, 2) + " ± " + svg::grouped(spread.deviation, 2);
+    return svg::grouped(spread.mean, decimals) + " ± " + svg::grouped(spread.deviation, decimals);
 }
 
 // The value of the last evaluation that has one.
@@ -447,8 +461,9 @@ struct Row {
 struct Group {
     Runs runs;                           // by method, then by the other settings, then by seed
     std::string task, conditions, file;  // conditions: preset and physics; file: the beginning of the figures' names
-    Quantity quantity;                   // which is compared with the paper
+    Quantity quantity;                   // which is compared with the paper; of own data the action error
     std::string unit;                    // its name
+    int decimals;                        // of its values
     std::vector<Row> rows = {};          // in the order of the runs
     Table in_all = {{"Other than the preset, in all of these runs"}, {}};
 
@@ -532,6 +547,7 @@ inline std::string subtitle_of_one(const Group& group, const Row& row) {
 // Charts of a column of progress.csv over another one, which never falls; file: the end of the name.
 struct Curve {
     const char *y, *x, *title, *unit, *file, *caption;
+    bool cuts_outliers = false;  // a first mean from before the network learned would flatten all others
 };
 constexpr Curve curves[] = {
     {"eval_score", "interactions", "evaluation score", "normalised score", "score", "Mean score of an evaluation."},
@@ -540,15 +556,18 @@ constexpr Curve curves[] = {
     {"eval_length", "updates", "evaluation length", "steps", "length-updates", "The same over updates."},
     {"rollout_return", "interactions", "return of online episodes", "return", "rollouts",
      "Mean over the episodes since the point before."},
-    {"held_out_log_prob", "updates", "log-probability, held out", "log pi(a | s, g) of a step", "held-out",
-     "Mean over the steps of the trajectories that are held out; for DT minus its loss."},
+    {"rollout_return", "updates", "return of online episodes", "return", "rollouts-updates", "The same over updates."},
     {"held_out_error", "updates", "action error, held out", "error", "held-out-error",
-     "The share of moves that are not the policy's most likely one, or the squared error of its mean."},
+     "The share of moves that are not the policy's most likely one, or the squared error of its mean.", true},
+    {"held_out_log_prob", "updates", "log-probability, held out", "log pi(a | s, g) of a step", "held-out",
+     "Mean over the steps of the trajectories that are held out.", true},
     {"loss", "updates", "loss", "L, eq. (9)", "loss",
-     "Mean over the updates since the point before, as in the other figures over updates but that of lambda."},
+     "Mean over the updates since the point before, as in the other figures over updates but that of lambda.", true},
+    {"squared_error", "updates", "loss of DT", "squared error", "dt-loss",
+     "Mean over the updates since the point before.", true},
     {"entropy", "updates", "entropy", "H-bar, eq. (10)", "entropy", "Of the policy, on the batches of the updates."},
     {"lambda", "updates", "lambda", "lambda, eq. (8)", "lambda", "The multiplier of the entropy constraint."},
-    {"gradient_norm", "updates", "gradient", "norm of the gradient", "gradient", "Before it is clipped."},
+    {"gradient_norm", "updates", "gradient", "norm of the gradient", "gradient", "Before it is clipped.", true},
     {"short", "updates", "steps that fall short", "share of the steps", "short",
      "Of the steps in the batches, those with d < e-hat: eq. (7) gives them the weight alpha."},
 };
@@ -558,6 +577,7 @@ constexpr Curve curves[] = {
 inline svg::Chart chart_of(const Group& group, const Curve& curve) {
     const std::string over = curve.x == std::string("updates") ? "updates" : "online interactions";
     svg::Chart chart{group.task + ": " + curve.title + " over " + over, "", over, curve.unit};
+    chart.cuts_outliers = curve.cuts_outliers;
     for (const Row& row : group.rows) {
         const bool level = row.any().offline_only() && !row.any().own();
         if (level && !std::string(curve.y).starts_with("eval_")) continue;
@@ -733,21 +753,27 @@ inline std::string verdict(const Group& group) {
     return out + ".";
 }
 
-// One line for each row: the number of seeds, our results as mean ± deviation over them, and the paper's.
+// One line for each row: the number of seeds, our results as mean ± deviation over them, and the paper's, if it has
+// the task.
 inline Table method_table(const Group& group) {
-    const bool scores = group.quantity != "eval_length";
-    Table table{{"Method", "Seeds", "Final " + group.unit, "Mean of last 10", "Paper", "Final return"}, {}};
+    const bool own = group.any().own(), scores = group.quantity == "eval_score";
+    Table table{{"Method", "Seeds", "Final " + group.unit, "Mean of last 10"}, {}};
+    for (const char* further : {"Paper", "Final return"})
+        if (!own) table.header.emplace_back(further);
     if (scores) table.header.push_back("Final length");
+    if (own) table.header.push_back("Final log-probability, held out");
     for (const Row& row : group.rows) {
         const auto mean = [&](Summary summary, const Quantity& quantity) {
-            return plus_minus(spread_of(row.runs, summary, quantity));
+            return plus_minus(spread_of(row.runs, summary, quantity), group.decimals);
         };
         std::string seeds = std::to_string(row.runs.size());
         if (unfinished(row.runs) > 0) seeds += " (" + std::to_string(unfinished(row.runs)) + " unfinished)";
         const PaperResult* paper = paper_result(row.any());
-        table.rows.push_back({row.label(), seeds, mean(final_value, group.quantity), mean(last_ten, group.quantity),
-                              paper ? paper->text() : "-", mean(final_value, "eval_return")});
-        if (scores) table.rows.back().push_back(mean(final_value, "eval_length"));
+        std::vector<std::string>& line = table.rows.emplace_back();
+        line = {row.label(), seeds, mean(final_value, group.quantity), mean(last_ten, group.quantity)};
+        if (!own) line.insert(line.end(), {paper ? paper->text() : "-", mean(final_value, "eval_return")});
+        if (scores) line.push_back(mean(final_value, "eval_length"));
+        if (own) line.push_back(plus_minus(spread_of(row.runs, final_value, "held_out_log_prob")));
     }
     return table;
 }
@@ -773,16 +799,17 @@ inline Table dose_table(const Group& group) {
 
 // One row for each run: how far it came, its own results, and where it lies.
 inline Table run_table(const Group& group) {
-    const bool grid = !group.any().mujoco && !group.any().own();
-    Table table{{"Run", "State", "Interactions", "Final " + group.unit, "Last 10"}, {}};
+    const bool own = group.any().own(), grid = !group.any().mujoco && !own;
+    Table table{{"Run", "State", own ? "Updates" : "Interactions", "Final " + group.unit, "Last 10"}, {}};
     if (grid) table.header.insert(table.header.end(), {"Shortest met", "At 5 from"});
     table.header.push_back("Folder");
     for (const Row& row : group.rows)
         for (const Run* run : row.runs) {
             std::vector<std::string>& line = table.rows.emplace_back();
-            line = {row.name_of(*run), run->finished ? "finished" : "unfinished", svg::grouped(run->so_far, 0)};
+            line = {row.name_of(*run), run->finished ? "finished" : "unfinished",
+                    svg::grouped(own ? final_value(*run, "updates") : run->so_far, 0)};
             for (const Summary summary : {final_value, last_ten})
-                line.push_back(svg::grouped(summary(*run, group.quantity), 2));
+                line.push_back(svg::grouped(summary(*run, group.quantity), group.decimals));
             if (grid)
                 line.insert(line.end(), {svg::grouped(shortest_met(*run), 0), svg::grouped(kept_from(*run, 5), 0)});
             line.push_back(run->folder);
@@ -863,8 +890,9 @@ inline void add_mujoco_task(std::vector<Part>& parts, const Group& group) {
 // Own data: the curves of what is held out follow with those of training.
 inline void add_own_data(std::vector<Part>& parts, const Group&) {
     parts.emplace_back(
-        "There is no environment: nothing is evaluated by acting. On the trajectories that are held out, how likely "
-        "the policy finds their actions, and how far its own are from them.");
+        "There is no environment: nothing is evaluated by acting. On the trajectories that are held out, how far the "
+        "policy's actions are from theirs (the share of other moves, or the squared error, a mean over an action's "
+        "numbers), and how likely it finds them, which a DT of continuous actions does not tell.");
 }
 
 // "Updates made, mean over seeds: ODT 42,000; WODTEM 143,000, 3.4 times those of ODT." and what follows from it.
@@ -897,11 +925,12 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
                 "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
                 name + "-" + settings.preset + (settings.physics == "2.2" ? "-physics-2.2" : ""),
                 mujoco ? "eval_score"
-                : own  ? "held_out_log_prob"
+                : own  ? "held_out_error"
                        : "eval_length",
                 mujoco ? "normalised score"
-                : own  ? "log-probability, held out"
+                : own  ? "action error, held out"
                        : "length",
+                own ? 4 : 2,
                 rows_of(runs)};
     name_differences(group);
     Section section{group.heading(), {method_table(group), run_table(group)}, verdict(group)};
@@ -918,11 +947,14 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
     add_curves(section.parts, group, [](auto column) { return !column.starts_with("eval_"); });
     for (const Table& table : {settings_table(group), time_table(group)})
         if (!table.rows.empty()) section.parts.emplace_back(table);
+    for (const Run* run : group.runs)
+        if (!run->time_error.empty()) section.parts.emplace_back("A run has no times: " + run->time_error + ".");
     section.parts.emplace_back(command_table(group));
     for (const Row& row : group.rows)
         for (const Run* run : row.runs) {
             std::error_code error;  // writing the page will fail with a sentence
-            const std::string folder = std::filesystem::relative(run->folder, out_folder, error);
+            const auto out = std::filesystem::absolute(out_folder, error);  // a relative path must exist
+            const std::string folder = std::filesystem::relative(run->folder, out, error);
             section.parts.emplace_back(Files{row.name_of(*run), folder, run->files});
         }
     return section;
@@ -943,7 +975,8 @@ inline std::vector<Section> make_sections(const std::vector<Run>& runs, const st
         "ODT 6.5 to 7.5).";
     const char* const figures =
         "Curves: each seed as a thin line, straight between its evaluations, which are dots where they can be told "
-        "apart; the mean of these lines, which ends where the first of them ends; diamonds: the paper's final results. "
+        "apart; the mean of these lines, which ends where the first of them ends; diamonds: the paper's final results; "
+        "what lies beyond the frame is drawn on its edge, and the line below the title says how far it goes. "
         "DT has no online phase: its evaluation is a dashed line across. Bars: mean over seeds; strokes: from the "
         "lowest to the highest seed. A run's file settings has the value of every setting and where it came from.";
     std::vector<Section> sections{{"How to read this", {numbers, figures}}};
@@ -971,7 +1004,7 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     const Markdown markdown;
     std::string text;
     for (const Section& section : sections) {
-        if (&section != &sections[0]) text += section.heading + "\n\n";  // the first explains the pages
+        if (&section != &sections[0]) text += markdown(section.heading);  // the first explains the pages
         for (const Part& part : section.parts) {
             if (const auto* table = std::get_if<Table>(&part); table && !table->pages_only) text += markdown(*table);
             if (const auto* figure = std::get_if<Figure>(&part))

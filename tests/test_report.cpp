@@ -592,7 +592,8 @@ TEST(training_is_drawn_over_updates_and_compared_in_a_sentence) {
     const auto shown = [&](const char* figure, const char* label) {
         return count(read_file(name + figure + ".svg"), std::string(">") + label + "<");
     };
-    for (const char* figure : {"length-updates", "loss", "entropy", "lambda", "gradient", "short", "rollouts"}) {
+    for (const char* figure :
+         {"length-updates", "loss", "entropy", "lambda", "gradient", "short", "rollouts", "rollouts-updates"}) {
         CHECK_CONTAINS(read_file(out + "/report.html"), read_file(name + figure + ".svg"));
         CHECK_EQUAL(shown(figure, "WODTEM"), size_t{1});
         CHECK_EQUAL(shown(figure, "ODT"), std::string(figure) == "short" ? size_t{0} : size_t{1});
@@ -635,19 +636,21 @@ TEST(bars_stand_on_one_scale_and_only_where_there_are_runs) {
     CHECK_EQUAL(count(episodes, ">WODTEM<"), size_t{0});
 }
 
-TEST(a_folder_of_runs_stands_for_the_runs_directly_below_it) {
+TEST(a_folder_of_runs_stands_for_the_runs_one_or_two_levels_below_it) {
     const TemporaryFolder temporary;
     const std::string runs = temporary.path + "/runs", out = runs + "/report";
     const std::string a = write_run(runs, "odt", 0, {{0, 9}, {90, 5}}), b = write_run(runs, "dt", 0, {{0, 9}});
-    write_run(runs + "/deeper", "odt", 1, {{0, 9}, {90, 5}});
+    const std::string c = write_run(runs + "/deeper", "odt", 1, {{0, 9}, {90, 5}});
     write(runs, "notes", "no folder");
-    const std::string text = report({a, b}, out);
+    for (const auto& [to, link] : {std::pair("circle", "/circle"), {".", "/here"}, {"..", "/deeper/up"}})
+        std::filesystem::create_symlink(to, runs + link);
+    const std::string text = report({a, b, c}, out);
     const std::string page = read_file(out + "/report.html");
     CHECK_EQUAL(report({runs}, out), text);
     CHECK(read_file(out + "/report.html") == page);
-    report({runs, runs + "/deeper"}, out);
-    CHECK_CONTAINS(read_file(out + "/report.md"), "# WODTEM: report on 3 runs\n");
-    for (const std::string& none_there : {temporary.path, runs + "/notes", runs + "/missing"})
+    CHECK_EQUAL(report({temporary.path}, out).find("ODT seed 1"), std::string::npos);  // three levels below
+    std::filesystem::create_directories(temporary.path + "/empty/a/b");
+    for (const std::string& none_there : {temporary.path + "/empty", runs + "/notes", runs + "/missing"})
         CHECK_FAILS("report.folder", report({none_there}, out));
     CHECK_FAILS("report.same_seed", report({runs, a}, out));
 }
@@ -672,11 +675,94 @@ TEST(pages_link_the_files_of_a_run_and_say_when_and_where_it_was_made) {
     write(run, "seconds.csv", header);
     report({run}, out);
     CHECK_EQUAL(count(read_file(out + "/report.md"), "Updates a second"), size_t{0});
-    for (const auto& [id, rows] :
-         {std::pair("csv.order", "0,0,5,a,m,p\n9,0,4,a,m,p\n"), {"csv.number", "0,0,x,a,m,p\n"}}) {
+    // No result depends on the file: one that cannot be read leaves dashes and a sentence.
+    for (const auto& [rows, what] : {std::pair("0,0,5,a,m,p\n9,0,4,a,m,p\n", "line 3: column \"seconds\" falls to 4"),
+                                     {"0,0,x\xff,a,m,p\n", "line 2: column \"seconds\" holds \"x\\xff\""},
+                                     {"0,0,1", "line 2 does not end"}}) {
         write(run, "seconds.csv", header + rows);
-        CHECK_FAILS(id, report({run}, out));
+        report({run}, out);
+        const std::string damaged = narrow(read_file(out + "/report.md"));
+        CHECK_CONTAINS(damaged, "| ODT seed 0 | - | - | - | - | - |");
+        CHECK_CONTAINS(damaged, "A run has no times: " + run + "/seconds.csv: " + what);
+        CHECK_CONTAINS(damaged, "| ODT | 1 | 5.00 ± - |");
     }
+    // Links count from a folder of pages that is not there yet, too.
+    const std::filesystem::path here = std::filesystem::current_path();
+    std::filesystem::current_path(temporary.path);
+    report({"odt-0"}, "fresh/pages");
+    std::filesystem::current_path(here);
+    CHECK_CONTAINS(read_file(temporary.path + "/fresh/pages/report.html"), "<a href=\"../../odt-0/settings\">");
+}
+
+// A finished run on own data: two evaluations, at updates 0 and 60; the numbers are those of the latter.
+std::string write_own_run(const std::string& parent, const std::string& method, const std::string& dataset,
+                          const std::string& sha256, int moves, const std::string& loss, const std::string& log_prob,
+                          const std::string& error) {
+    const std::string folder = parent + "/" + method + "-" + sha256 + "-" + std::to_string(moves);
+    Settings settings = default_settings(own_data, method, "small");
+    set_from(settings, "dataset", dataset, "own data");
+    set_from(settings, "dataset_sha256", sha256, "of the file");
+    for (const auto& [name, value] : {std::pair("state_dim", 2), {"action_dim", 1}, {"moves", moves}})
+        set_from(settings, name, std::to_string(value), "the data set");
+    write(folder, "settings", settings_text(settings));
+    write(folder, "command", train_command(settings) + "\n");
+    write(folder, "progress.csv",
+          "updates,interactions,eval_length,eval_return,eval_score,loss,held_out_log_prob,held_out_error\n"
+          "0,0,nan,nan,nan,nan,-9,0.9\n60,0,nan,nan,nan," +
+              loss + "," + log_prob + "," + error + "\n");
+    write(folder, "episodes.csv", "interactions,length,return\n");
+    write(folder, "finished", "");
+    return folder;
+}
+
+TEST(own_data_are_compared_by_their_action_error_and_named_where_they_differ) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out", figures = out + "/data-own-small-";
+    const auto run = [&](const char* method, const char* sha256, int moves, const char* log_prob, const char* error) {
+        return write_own_run(temporary.path, method, "own.hdf5", sha256, moves, "0.5", log_prob, error);
+    };
+    const std::string dt = run("dt", "aaaaaaaaaa", 0, "-0.25", "0.25");
+    const std::string odt = run("odt", "aaaaaaaaaa", 0, "-7", "0.125");
+    std::string text = narrow(report({dt, odt}, out));
+    for (const char* row :
+         {"| Method | Seeds | Final action error, held out | Mean of last 10 | Final log-probability, held out |",
+          "| DT | 1 | 0.2500 ± - | 0.5750 ± - | - |", "| ODT | 1 | 0.1250 ± - | 0.5125 ± - | −7.00 ± - |",
+          "| Run | State | Updates | Final action error, held out | Last 10 | Folder |",
+          "| ODT seed 0 | finished | 60 | 0.1250 | 0.5125 |", "| dataset=own.hdf5 (SHA-256 aaaaaaaa) |"})
+        CHECK_CONTAINS(text, row);
+    // A squared error stands in no picture of likelihoods.
+    for (const auto& [figure, dts, odts] :
+         {std::tuple("held-out-error", 1, 1), {"held-out", 0, 1}, {"loss", 0, 1}, {"dt-loss", 1, 0}}) {
+        const std::string svg_text = read_file(figures + (figure + std::string(".svg")));
+        CHECK_EQUAL(count(svg_text, ">DT<"), static_cast<size_t>(dts));
+        CHECK_EQUAL(count(svg_text, ">ODT<"), static_cast<size_t>(odts));
+    }
+    // DT of moves is trained by their likelihood.
+    text = narrow(report({run("dt", "aaaaaaaaaa", 4, "-0.5", "0.25")}, out));
+    CHECK_CONTAINS(text, "| DT | 1 | 0.2500 ± - | 0.5750 ± - | −0.50 ± - |");
+    text = narrow(report({odt, run("odt", "bbbbbbbbbb", 0, "-7", "0.5")}, out));
+    CHECK_CONTAINS(text, "| ODT (dataset=own.hdf5 (SHA-256 aaaaaaaa)) | 1 | 0.1250 ± - |");
+    CHECK_CONTAINS(text, "| ODT (dataset=own.hdf5 (SHA-256 bbbbbbbb)) | 1 | 0.5000 ± - |");
+}
+
+TEST(a_data_set_may_have_any_name) {
+    const TemporaryFolder temporary;
+    const std::string out = temporary.path + "/out";
+    const std::string line = write_own_run(temporary.path, "dt", "a\nb|.hdf5", "a", 0, "1", "-1", "1");
+    const std::string byte = write_own_run(temporary.path, "odt", "a\xff.hdf5", "b", 0, "1", "-1", "1");
+    report({line, byte}, out);
+    const std::string markdown = narrow(read_file(out + "/report.md")), page = read_file(out + "/report.html");
+    CHECK(is_utf8(markdown) && is_utf8(page));
+    CHECK_CONTAINS(markdown, "\n## data-a\\x0ab|, preset small\n");
+    CHECK_CONTAINS(markdown, "| dataset=a\\x0ab\\|.hdf5 (SHA-256 a) |");
+    CHECK_CONTAINS(markdown, "![](data-a%0Ab|-small-held-out-error.svg)");
+    CHECK(std::filesystem::exists(out + "/data-a\nb|-small-held-out-error.svg"));
+    CHECK_CONTAINS(page, ">data-a\\xff: action error, held out over updates<");
+    // The shell reads the printed name as it is.
+    const size_t at = page.find("./wodtem train ") + 15;
+    const std::string word = page.substr(at, page.find(" --method", at) - at), copy = temporary.path + "/word";
+    CHECK_EQUAL(std::system(("bash -c " + shell_word("printf %s " + word + " > " + copy)).c_str()), 0);
+    CHECK_EQUAL(std::filesystem::path(read_file(copy)).filename().string(), "a\nb|.hdf5");
 }
 
 // The command in a report's only table of commands with one run.
