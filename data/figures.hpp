@@ -135,11 +135,11 @@ struct Key {
 };
 
 // The title with a smaller line below it, the marks, and the legend in as many rows as it needs, the first at height
-// `y`, on a white ground. Titles that are too long for `w` are set in smaller type, and below 10 widen the ground.
+// `y`, on a white ground. Titles that are too long for `w` are set in smaller type, and below 8 widen the ground.
 inline std::string picture(double w, double y, const std::string& title, const std::string& subtitle, std::string marks,
                            const std::vector<Key>& keys) {
     const auto type_of = [room = 13 * (w - 32)](const std::string& line, double most) {
-        return std::clamp(room / text_width(line), 10.0, most);
+        return std::clamp(room / text_width(line), 8.0, most);
     };
     const double title_type = type_of(title, 17), subtitle_type = type_of(subtitle, 12);
     w = std::max({w, 32 + text_width(title) * title_type / 13, 32 + text_width(subtitle) * subtitle_type / 13});

@@ -714,11 +714,11 @@ TEST(legend_begins_a_new_row_before_the_edge) {
     CHECK_EQUAL(count(svg, "translate(16 100 )") + count(svg, "translate(123.51 100 )"), size_t{2});
     CHECK_EQUAL(count(svg, "translate(16 124 )"), size_t{1});
     CHECK_EQUAL(count(svg, "viewBox=\"0 0 250 146 \""), size_t{1});
-    // A long title is set smaller, 218 / (0.61 * 30), and at 10 makes the figure wider: 32 + 10 * 0.61 * 40.
+    // A long title is set smaller, 218 / (0.61 * 30), and at 8 makes the figure wider: 32 + 8 * 0.61 * 50.
     const std::string smaller = svg::picture(250, 100, std::string(30, 't'), "", "", keys);
     CHECK_EQUAL(count(smaller, "viewBox=\"0 0 250 146 \""), size_t{1});
     CHECK_EQUAL(count(smaller, "font-size=\"11.91\""), size_t{1});
-    CHECK_EQUAL(count(svg::picture(250, 100, std::string(40, 't'), "", "", {}), "viewBox=\"0 0 276 122 \""), size_t{1});
+    CHECK_EQUAL(count(svg::picture(250, 100, std::string(50, 't'), "", "", {}), "viewBox=\"0 0 276 122 \""), size_t{1});
 }
 
 TEST(map_draws_one_arrow_per_action_on_filled_cells) {
