@@ -747,7 +747,7 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
 }
 
 // Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint.
-bool begin_or_continue(Run& run, RunFolder& folder) {
+bool begin_or_continue(Run& run, RunFolder& folder) try {
     const Settings& settings = run.agent.settings;
     const bool resumed = folder.has("checkpoint.safetensors");
     if (resumed)
@@ -757,6 +757,9 @@ bool begin_or_continue(Run& run, RunFolder& folder) {
     if (resumed && run.progress.online == 0)  // the checkpoint does not hold the data set
         start_offline(run, offline_set(make_data_set(settings), settings.keep_lowest));
     return resumed;
+} catch (...) {
+    forget_start(folder);
+    throw;
 }
 
 // What trains on a file alone, acts on lines of text and asks the policy for figures, by the functions above.
@@ -906,7 +909,7 @@ void command_eval(const Arguments& arguments) {
     const Environments environments(*make_environment(settings), settings.eval_episodes);
     const Evaluation evaluation = evaluate(actor.agent, actor.acting, environments.all(), first);
     print_evaluation(settings, evaluation.episodes, evaluation.mean_length, evaluation.mean_return);
-    if (arguments.has("--record")) write_episodes(arguments["--record"], evaluation.episodes);
+    if (arguments.has("--record")) write_episodes(arguments["--record"], evaluation.episodes, actor.agent.discrete());
 }
 
 void command_act(const Arguments& arguments) {
@@ -941,8 +944,7 @@ void command_collect(const Arguments& arguments) {
 // Without a task the list of tasks; with one its settings.
 void command_tasks(const Arguments& arguments) {
     if (arguments.words.empty()) return print_tasks();
-    const Settings settings = default_settings(arguments.words[0], arguments["--method"], arguments["--preset"]);
-    std::printf("%s", settings_text(settings).c_str());
+    print_settings(arguments);
 }
 
 // The verdict is the last thing printed.
@@ -986,7 +988,7 @@ const Command commands[] = {
      "updates: kernels and updates beside the machine's peaks, look-ups; environments: steps a second; random-policy",
      command_bench},
     {"check", "FILE...", 0, 10000, "recompute golden vectors, ours or yours, and compare", command_check},
-    {"tasks", "[TASK]", 0, 1, "list tasks, or the settings of one with their sources", command_tasks},
+    {"tasks", "[TASK|FILE]", 0, 1, "list tasks, or the settings of one with their sources", command_tasks},
 };
 
 #ifndef WODTEM_NO_MAIN

@@ -431,6 +431,11 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
         fail("usage.task", "collect makes stand-ins for the paper's data sets, and \"%s\" is none%s", id.c_str(),
              nearest_hint(id, names).c_str());
     }
+    if (walker && steps > 0)
+        fail("usage.option", "collect %s trains a policy and makes no rows; leave --steps out", id.c_str());
+    if (!policy.empty() && (walker || id.starts_with("maze2d") || id.find("-medium-replay") != std::string::npos))
+        fail("usage.option", "no given policy acts in %s, which %s; leave --policy out", id.c_str(),
+             id.starts_with("maze2d") ? "a planner and a controller make" : "is made by training one");
     if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);
     const std::string name = walker ? id + ".safetensors" : file_name(*set);
     const std::string path = out.empty() ? std::string(own_folder) + "/" + name : out;

@@ -288,9 +288,25 @@ inline const Kernel& kernel_for(const std::string& arithmetic) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Settings from the command line.
 
+// The data set's file for these settings. before, here and below: settings of the same command and file, if there are
+// any, so that the file is not read again.
+inline void take_file(Settings& settings, const std::string& path, const Settings* before) {
+    settings.dataset_path = path;
+    settings.dataset = data_set_name(path);
+    settings.dataset_sha256 = before ? before->dataset_sha256 : sha256_of_file(path);
+}
+
+// Where the data set of settings that a file holds lies now. whose: that file. Errors: dataset.other.
+inline void find_data_again(Settings& settings, const std::string& path, const std::string& whose) {
+    settings.dataset_path = path;
+    if (sha256_of_file(path) != settings.dataset_sha256)
+        fail("dataset.other", "%s is not the data set of %s, whose SHA-256 is %s; give it by --dataset", path.c_str(),
+             whose.c_str(), settings.dataset_sha256.c_str());
+}
+
 // given: a file; "random": none, so ten episodes of random actions and the online phase alone; "": the file of the
 // task's id. Errors: dataset.missing, also where no data set has that name.
-inline void choose_data_set(Settings& settings, const std::string& given) {
+inline void choose_data_set(Settings& settings, const std::string& given, const Settings* before) {
     const PublishedDataSet* published = find_published(settings.task);
     if (given.empty() && !published)
         fail("dataset.missing",
@@ -303,22 +319,19 @@ inline void choose_data_set(Settings& settings, const std::string& given) {
             set_from(settings, "offline_updates", "0", "there is no data set: the online phase alone");
         return;
     }
-    settings.dataset_path = given.empty() ? find_data_set(*published) : data_set_file(given);
-    settings.dataset_sha256 = sha256_of_file(settings.dataset_path);
-    settings.dataset = std::filesystem::path(settings.dataset_path).filename();
+    take_file(settings, given.empty() ? find_data_set(*published) : data_set_file(given), before);
     const bool original = published && settings.dataset_sha256 == published->sha256;
     settings.source["dataset"] = original ? "D4RL's published file" : "not known as a published file";
 }
 
 // What own data decide by themselves: sizes, the entropy's bound, and what a return is compared with. Errors: those of
 // load_own_data().
-inline void choose_own_data(Settings& settings, const std::string& given) {
-    const std::string path = data_set_file(given);
-    settings.dataset_path = path;
-    settings.dataset_sha256 = sha256_of_file(path);
-    settings.dataset = std::filesystem::path(path).filename();
+inline void choose_own_data(Settings& settings, const std::string& given, const Settings* before = nullptr) {
+    take_file(settings, data_set_file(given), before);
     settings.source["dataset"] = "own data";
-    const OwnData data = load_own_data(path, settings.clip_actions);
+    settings.own =
+        before ? before->own : std::make_shared<OwnData>(load_own_data(settings.dataset_path, settings.clip_actions));
+    const OwnData& data = *settings.own;
     double best = -INFINITY, largest = 0;  // of the returns; of their absolute values
     for (const Trajectory& trajectory : data.trajectories) {
         const double total = returns_to_go(trajectory.rewards).front();
@@ -369,25 +382,29 @@ inline bool is_data_file(const std::string& task) {
 
 // What a task, or the path of own data in its place, makes the settings before --set. Errors: usage.*, and for own data
 // those of load_own_data().
-inline Settings chosen_settings(const Arguments& arguments, const std::string& task, const std::string& method) {
+inline Settings chosen_settings(const Arguments& arguments, const std::string& task, const std::string& method,
+                                const Settings* before = nullptr) {
     const bool own = is_data_file(task);
     if (own && arguments.has("--dataset"))
         fail("usage.option", "two data sets are given; to train on one of them for a task, name the task first");
     Settings settings = default_settings(own ? own_data : task, method, arguments["--preset"]);
     if (arguments.has("--clip-actions")) set_from(settings, "clip_actions", "yes", "command line");
-    if (own) choose_own_data(settings, task);
+    if (own) choose_own_data(settings, task, before);
     return settings;
 }
 
 // The settings of one run but for its seed, for the options that train and import share. Errors: usage.*,
 // dataset.missing.
-inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method) {
-    Settings settings = chosen_settings(arguments, task, method);
+inline Settings settings_of(const Arguments& arguments, const std::string& task, const std::string& method,
+                            const Settings* before = nullptr) {
+    Settings settings = chosen_settings(arguments, task, method, before);
     if (find_mujoco_task(settings.task)) {
         settings.mujoco = mujoco_version();
-        choose_data_set(settings, arguments["--dataset"]);
+        choose_data_set(settings, arguments["--dataset"], before);
     } else if (arguments.has("--dataset")) {
-        fail("usage.option", "the grid world makes its own data set; leave --dataset out");
+        fail("usage.option", "%s; leave --dataset out",
+             settings.task == own_data ? "the file of own data stands in the task's place, as in wodtem train FILE.hdf5"
+                                       : "the grid world makes its own data set");
     }
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
     apply_assignments(settings, arguments.assignments);
@@ -414,12 +431,21 @@ inline Settings evaluated_settings(const Arguments& arguments, const TensorFile&
     return settings;
 }
 
-// Of a network to import: those in the file, or with --task those of the command line. Errors: usage.*, settings.*.
+// Of a network to import: with --task those of the command line; else those in the file, for which --dataset alone may
+// be given. Errors: usage.*, settings.*, dataset.other.
 inline Settings imported_settings(const Arguments& arguments, const TensorFile& file) {
     if (arguments.has("--task")) return settings_of(arguments, arguments["--task"], arguments["--method"]);
-    if (file.metadata.contains("settings")) return settings_in(file);
-    fail("usage.option", "%s does not tell its settings; give --task, and --method, --preset, --set as in train",
-         file.path.c_str());
+    if (!file.metadata.contains("settings"))
+        fail("usage.option", "%s does not tell its settings; give --task, and --method, --preset, --set as in train",
+             file.path.c_str());
+    Settings settings = settings_in(file);
+    for (const std::string& option : arguments.given)
+        if (option != "--dataset" || settings.dataset_sha256 == "none")
+            fail("usage.option",
+                 "%s holds its own settings%s, so %s would change nothing; leave it out, or give --task",
+                 file.path.c_str(), option == "--dataset" ? ", of a run that read no file" : "", option.c_str());
+    if (arguments.has("--dataset")) find_data_again(settings, data_set_file(arguments["--dataset"]), file.path);
+    return settings;
 }
 
 // One of the runs that a train command asks for.
@@ -448,8 +474,10 @@ inline std::vector<PlannedRun> planned_runs(const Arguments& arguments) {
     const size_t count = methods.size() * seeds.size();
     std::vector<PlannedRun> runs;
     for (const std::string& method : methods) {
+        const Settings* before = runs.empty() ? nullptr : &runs[0].settings;
+        const Settings of_method = settings_of(arguments, arguments.words[0], method, before);
         for (const int64_t seed : seeds) {
-            Settings settings = settings_of(arguments, arguments.words[0], method);
+            Settings settings = of_method;
             settings.seed = seed;
             const std::string folder = folder_of(arguments, settings);
             if (arguments.has("--weights")) {
@@ -482,7 +510,7 @@ inline std::vector<Settings> swept_settings(const Arguments& arguments) {
     std::vector<Settings> sweep;
     for (const std::string& method : split(arguments["--methods"], ',')) {
         const std::string task = arguments.words.empty() ? "gridworld" : arguments.words[0];
-        sweep.push_back(chosen_settings(arguments, task, method));
+        sweep.push_back(chosen_settings(arguments, task, method, sweep.empty() ? nullptr : &sweep[0]));
         apply_assignments(sweep.back(), arguments.assignments);
         check_together(sweep.back());
     }
@@ -507,6 +535,24 @@ inline void print_sweep(const std::vector<Settings>& sweep, const Arguments& arg
     if (estimate)
         std::printf("# about %.1f hours on this machine, one after the other; what is interrupted continues\n",
                     seconds * static_cast<double>(seeds.size()) / 3600);
+}
+
+// The command `tasks TASK`: what `train` would begin with, in two parts, which together are a file of settings.
+inline void print_settings(const Arguments& arguments) {
+    Settings settings = chosen_settings(arguments, arguments.words[0], arguments["--method"]);
+    if (find_mujoco_task(settings.task)) {
+        const PublishedDataSet* published = find_published(settings.task);
+        if (published) settings.dataset = file_name(*published);
+        settings.source["dataset"] = published ? "looked for in D4RL's folder and runs/datasets; or see --dataset"
+                                               : "no data set has this name: see --dataset";
+        settings.mujoco = mujoco_version();
+    }
+    for (const bool for_set : {false, true}) {
+        std::printf("# %s:\n", for_set ? "Settings for --set" : "Decided by options, or by what they name");
+        for (const std::string& line : split(settings_text(settings), '\n'))
+            if (!line.empty() && contains(not_for_set, line.substr(0, line.find(' '))) != for_set)
+                std::printf("%s\n", line.c_str());
+    }
 }
 
 // The help of train: every setting.

@@ -51,17 +51,21 @@ inline void print_data_set(const std::string& path, std::string id) {
     if (task)
         std::printf("mean normalised score of a trajectory: %.2f (%s)\n",
                     normalised_score(*task, statistics.returns.mean()), task->name);
-    for (const Physics physics : {Physics::d4rl, Physics::mujoco_2_2}) {
-        const std::vector<double> found = task ? transition_differences(rows, *task, physics) : std::vector<double>();
-        if (found.empty()) continue;
-        std::printf(
-            "physics %-4s %zu recorded steps taken again end %.2g from the recorded state (median), at most %.2g\n",
-            physics_names[static_cast<size_t>(physics)], found.size(), found[found.size() / 2], found.back());
-    }
     if (task) {
+        const TransitionsOfPhysics transitions = transitions_of_each_physics(rows, *task);
+        for (size_t i = 0; i < transitions.size(); ++i) {
+            if (transitions[i].empty()) continue;
+            const std::optional<size_t> first = first_far_off(transitions[i]);
+            std::printf(
+                "physics %-4s %zu recorded steps taken again end %.2g from the recorded state (median), at most "
+                "%.2g%s\n",
+                physics_names[i], transitions[i].size(), median_of(transitions[i]), transitions[i].back().difference,
+                first ? text_of("; the first that ends ", far_off, " or more from it is row ", *first).c_str() : "");
+        }
         const std::string places = remark_on_places(rows, *task, rows_outside(rows, *task));
         if (!places.empty()) std::printf("note: %s\n", places.c_str());
-        for (const std::string& remark : remarks_on(rows, *task, "d4rl")) std::printf("note: %s\n", remark.c_str());
+        for (const std::string& remark : remarks_on(rows, *task, "d4rl", transitions))
+            std::printf("note: %s\n", remark.c_str());
     }
     print_published(find_published(id));
 }

@@ -312,10 +312,9 @@ void import_odt(const TensorFile& file, const Settings& settings, const std::str
     require(model.state_mean.empty() == model.state_std.empty(), "import.metadata", file.path,
             ": has one of state_mean and state_std; it needs both, or neither");
     if (model.state_mean.empty()) {
-        const bool has_data =
-            settings.behaviour != "random" && (settings.task != own_data || !settings.dataset_path.empty());
+        const bool has_data = settings.task == "gridworld" || !settings.dataset_path.empty();
         require(has_data, "import.normaliser", file.path,
-                " has no state_mean and state_std, and there is no data set to take them from; see --dataset");
+                " has no state_mean and state_std; give the data set from which to take them by --dataset");
         find_statistics(model);
     }
     check_model(contents, file.path);

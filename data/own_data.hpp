@@ -59,6 +59,11 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
 }
 
 void print_held_out(const Run& run, const std::string& path, const HeldOut& held_out, size_t trajectories) {
+    if (trajectories == 0) {
+        std::printf("%s: %s updates; no trajectory is held out, so nothing is measured\n", path.c_str(),
+                    number_text(run.progress.updates).c_str());
+        return;
+    }
     std::printf("%s: %s updates; %zu trajectories held out: log-probability of an action %s, %s %s\n", path.c_str(),
                 number_text(run.progress.updates).c_str(), trajectories,
                 number_text(static_cast<float>(held_out.log_prob)).c_str(),
@@ -71,7 +76,6 @@ void print_held_out(const Run& run, const std::string& path, const HeldOut& held
 // the latest one, under the present budget.
 void fit_own_data(Run& run, const Observer& observer, const std::string& path) {
     const std::vector<Trajectory> held_out = part_of_own_data(run.agent.settings, true);
-    if (held_out.empty()) std::fprintf(stderr, "%s: no trajectory is held out, so nothing is measured\n", path.c_str());
     Progress& p = run.progress;
     const uint64_t updates = static_cast<uint64_t>(run.agent.settings.offline_updates);
     const uint64_t every = std::max<uint64_t>(1, (updates + 9) / 10);
@@ -132,13 +136,10 @@ inline std::string act_help() {
 
 // The numbers of a line. Errors: act.line.
 std::vector<double> numbers_of_line(const std::string& line, size_t number, size_t state_dim) {
-    std::vector<double> values;
-    for (const std::string& part : split(line, ',')) {
-        const std::optional<double> x = to_number(trimmed(part));
-        require(x && std::isfinite(static_cast<float>(*x)), "act.line", "line ", number, " of the input: \"",
-                part.substr(0, 40), "\" is not a finite number");
-        values.push_back(*x);
-    }
+    std::vector<double> values = numbers_between_commas<float>(line, [&](const std::string& part) {
+        throw Error("act.line",
+                    text_of("line ", number, " of the input: \"", part.substr(0, 40), "\" is not a finite number"));
+    });
     require(values.size() == state_dim || values.size() == state_dim + 1, "act.line", "line ", number,
             " of the input has ", values.size(), " numbers; expected the ", state_dim,
             " of a state, or the return that is wanted and these");
@@ -175,6 +176,7 @@ void act_on_lines(const Agent& agent, Tape<float>& acting, const std::string& pa
     while (!std::ferror(stdout) && std::getline(input, line)) {
         ++number;
         if (line.ends_with('\r')) line.pop_back();
+        if (number == 1 && line.starts_with("\xEF\xBB\xBF")) line.erase(0, 3);  // some editors begin a file so
         if (trimmed(line).empty()) {
             episode = {};
             continue;

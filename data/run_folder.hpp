@@ -395,6 +395,15 @@ inline void claim_folder(const RunFolder& folder, const Settings& settings) {
     if (!folder.has("finished")) write_file_atomic(folder.file("command"), train_command(settings) + "\n");
 }
 
+// Of a run that failed before its first row: nothing of it stays, or the folder would pass for an unfinished run.
+inline void forget_start(const RunFolder& folder) {
+    if (folder.has("progress.csv") || folder.has("checkpoint.safetensors")) return;
+    remove_file(folder.file("settings"));
+    remove_file(folder.file("command"));
+    std::error_code not_empty;
+    std::filesystem::remove(folder.path, not_empty);
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // The checkpoint. visit(archive) calls archive(name, field) for everything that is state.
 

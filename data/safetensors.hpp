@@ -675,6 +675,8 @@ TensorFile parse_safetensors(size_t size, const std::string& path, const auto& r
     size_t length = 0;
     require(size >= 8, "safetensors.truncated", path, ": offset 0: ", size, " bytes are too few for a header length");
     read(file.buffer, 8);
+    require(!file.buffer.starts_with("\x89HDF"), "safetensors.header_length", path,
+            ": is an HDF5 file, so a data set (see wodtem info), where a safetensors file is expected");
     std::memcpy(&length, file.buffer.data(), 8);
     require(length <= header_limit, "safetensors.header_length", path, ": offset 0: header length ", length,
             " is above ", header_limit, "; not a safetensors file?");

@@ -63,6 +63,19 @@ inline std::optional<double> to_number(const std::string& text) {
     return x;
 }
 
+// The numbers of a line, separated by commas and perhaps blanks, of which each must be finite as a Number. refuse(part)
+// throws, for a part that is none.
+template <class Number>
+std::vector<double> numbers_between_commas(const std::string& line, const auto& refuse) {
+    std::vector<double> values;
+    for (const std::string& part : split(line, ',')) {
+        const std::optional<double> x = to_number(trimmed(part));
+        if (!x || !std::isfinite(static_cast<Number>(*x))) refuse(part);
+        values.push_back(*x);
+    }
+    return values;
+}
+
 // The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest
 // number in it; `name` begins the sentence.
 inline double number_in(const std::string& text, const char* id, const char* name, auto low, auto high, bool whole) {
@@ -70,9 +83,9 @@ inline double number_in(const std::string& text, const char* id, const char* nam
     const std::optional<double> x = to_number(text);
     const double within = std::clamp(x.value_or(least), least, most), nearest = whole ? std::round(within) : within;
     if (x != nearest)
-        fail(id, "%s cannot be \"%s\"; it is a %snumber from %s to %s; the nearest is %s", name, text.c_str(),
-             whole ? "whole " : "", number_text(low).c_str(), number_text(high).c_str(),
-             number_text(static_cast<decltype(low)>(nearest)).c_str());
+        fail(id, "%s cannot be \"%s\"; it is a %snumber from %s to %s%s", name, text.c_str(), whole ? "whole " : "",
+             number_text(low).c_str(), number_text(high).c_str(),
+             x ? ("; the nearest is " + number_text(static_cast<decltype(low)>(nearest))).c_str() : "");
     return *x;
 }
 
@@ -135,6 +148,8 @@ int index_of(const std::array<const char*, N>& names, const std::string& name) {
 // ---------------------------------------------------------------------------------------------------------------------
 // The tables.
 
+struct OwnData;  // d4rl.hpp
+
 // The initial values are those of the paper's grid world.
 struct Settings {
     std::string task = "gridworld", method = "wodtem", preset = "small", arithmetic = "fused";
@@ -169,6 +184,7 @@ struct Settings {
 
     std::map<std::string, std::string> source;  // name -> source, of values that differ from `setting_rows`
     std::string dataset_path, weights_path;     // not settings: a run may continue on another machine
+    std::shared_ptr<const OwnData> own;         // nor this: what own data's file holds, where it has been read
 };
 
 using Field = std::variant<bool Settings::*, int64_t Settings::*, double Settings::*, std::string Settings::*>;

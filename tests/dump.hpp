@@ -152,11 +152,10 @@ void dump_run(const std::string& path, RunFolder folder, const Arguments& argume
         const PublishedDataSet* published = find_published(settings.task);
         if (arguments["--dataset"].empty() && !published)
             fail("dump.dataset", "%s: give its data set by --dataset", folder.path.c_str());
-        settings.dataset_path =
-            arguments["--dataset"].empty() ? find_data_set(*published) : data_set_file(arguments["--dataset"]);
-        if (sha256_of_file(settings.dataset_path) != settings.dataset_sha256)
-            fail("dump.dataset", "%s is not the data set of %s, whose SHA-256 is %s; give it by --dataset",
-                 settings.dataset_path.c_str(), folder.path.c_str(), settings.dataset_sha256.c_str());
+        find_data_again(
+            settings,
+            arguments["--dataset"].empty() ? find_data_set(*published) : data_set_file(arguments["--dataset"]),
+            folder.path);
     }
     for (const std::string& input :
          {folder.file("settings"), folder.file("checkpoint.safetensors"), settings.dataset_path})

@@ -57,7 +57,7 @@ void hdf5(const std::string& input) {
             require_sound(rows, "input");
             describe(statistics_of(rows, trajectories));
             remark_on_places(rows, task, rows_outside(rows, task));
-            remarks_on(rows, task, "d4rl");
+            remarks_on(rows, task, "d4rl", transitions_of_each_physics(rows, task));
         } catch (const Error&) {
         }
     const Rows rows = read_data_set(file);

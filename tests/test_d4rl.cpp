@@ -133,6 +133,24 @@ TEST(episodes_of_minari_whose_numbers_have_gaps_are_all_read) {
         file.attributes["total_episodes"] = stated;
         CHECK_FAILS("dataset.episodes", read_minari(file));
     }
+    file.attributes["total_episodes"] = 3;
+    for (const auto& [steps, id] : {std::pair(6.0, ""), {5.0, "dataset.episodes"}, {7.0, "dataset.episodes"}}) {
+        file.attributes["total_steps"] = steps;
+        if (*id)
+            CHECK_FAILS(id, read_minari(file));
+        else
+            CHECK_EQUAL(read_minari(file).count, size_t{6});
+    }
+    for (const auto& [name, length, known] :
+         {std::tuple("dones", 2, false), {"dones", 1, true}, {"infos/dones", 2, true}}) {
+        std::map<std::string, uint64_t> more = columns;
+        more[std::string("episode_7/") + name] = static_cast<uint64_t>(length);
+        const Hdf5File with_more = made_file.with(more, flags);
+        if (known)
+            CHECK_EQUAL(read_minari(with_more).count, size_t{6});
+        else
+            CHECK_FAILS("dataset.column", read_minari(with_more));
+    }
     columns["episode_3/infos/x"] = 1;  // an episode of which a part is missing
     CHECK_FAILS("dataset.shape", read_minari(made_file.with(columns, flags)));
     columns.erase("episode_3/infos/x");
@@ -161,6 +179,10 @@ Hdf5File file_of_minari(const std::string& name) {
     return parse_hdf5(std::string(bytes.begin(), bytes.end()), name);
 }
 
+std::vector<std::string> remarks_of(const Rows& rows, const MujocoTask& task, const std::string& physics) {
+    return remarks_on(rows, task, physics, transitions_of_each_physics(rows, task));
+}
+
 bool some_contain(const std::vector<std::string>& sentences, const std::string& part) {
     return std::ranges::any_of(sentences, [&](const auto& one) { return one.find(part) != std::string::npos; });
 }
@@ -182,7 +204,7 @@ TEST(pointmaze_of_minari_is_maze2d_turned_and_moved) {
     CHECK_EQUAL(file.find("episode_0/rewards")->type, "int64");
     CHECK(rows.timeouts[11] == 1 && rows.timeouts[23] == 1 && std::ranges::count(rows.timeouts, 1) == 2);
     CHECK(rows_outside(rows, task).empty());
-    const std::vector<std::string> remarks = remarks_on(rows, task, "d4rl");
+    const std::vector<std::string> remarks = remarks_of(rows, task, "d4rl");
     CHECK_EQUAL(remarks.size(), size_t{1});
     CHECK(some_contain(remarks, "the state is observation") && some_contain(remarks, "0.45"));
 #ifdef WODTEM_MUJOCO
@@ -210,14 +232,14 @@ TEST(recorded_transitions_tell_the_bodies_that_made_them) {
     const MujocoTask& hopper = *find_mujoco_task("hopper");
     const Rows rows = read_minari(file_of_minari("hopper"));
     const auto largest = [&](const Rows& data, Physics physics) {
-        const std::vector<double> differences = transition_differences(data, hopper, physics);
+        const std::vector<Transition> differences = transition_differences(data, hopper, physics);
         CHECK(differences.size() > 20 && std::ranges::is_sorted(differences));
-        return differences.back();
+        return differences.back().difference;
     };
     CHECK(largest(rows, Physics::mujoco_2_2) < 1e-5);  // the observations of the file, in float
     CHECK(largest(rows, Physics::d4rl) > 1e-3);
-    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "choose these with --physics 2.2"));
-    CHECK(remarks_on(rows, hopper, "2.2").empty());
+    CHECK(some_contain(remarks_of(rows, hopper, "d4rl"), "choose these with --physics 2.2"));
+    CHECK(remarks_of(rows, hopper, "2.2").empty());
     Rows own;
     MujocoEnvironment environment(hopper, Physics::d4rl);
     own.state_dim = 11;
@@ -233,8 +255,20 @@ TEST(recorded_transitions_tell_the_bodies_that_made_them) {
     CHECK(largest(own, Physics::d4rl) < 1e-4);
     CHECK(largest(own, Physics::mujoco_2_2) > 1e-3);
     own.of_minari = true;  // which does not make them Gymnasium's
-    CHECK(remarks_on(own, hopper, "d4rl").empty());
-    CHECK(some_contain(remarks_on(own, hopper, "2.2"), "choose these with --physics d4rl"));
+    CHECK(remarks_of(own, hopper, "d4rl").empty());
+    CHECK(some_contain(remarks_of(own, hopper, "2.2"), "choose these with --physics d4rl"));
+    Rows spoilt = own;
+    size_t row = 99;  // of 450 rows, 200 are taken again: 0, 2, 4, 6, 9, ...
+    while (own.ends(row)) row += 9;
+    CHECK(!first_far_off(transition_differences(own, hopper, Physics::d4rl)));
+    spoilt.observations[(row + 1) * 11] += 1;  // a step to elsewhere
+    CHECK(first_far_off(transition_differences(spoilt, hopper, Physics::d4rl)) == row);
+    CHECK(remarks_of(spoilt, hopper, "d4rl").empty());
+    for (size_t i = 0; i < spoilt.observations.size(); ++i)  // what no body did
+        spoilt.observations[i] = static_cast<float>((i * 37) % 251) / 251;
+    for (const char* physics : {"d4rl", "2.2"})
+        CHECK(some_contain(remarks_of(spoilt, hopper, physics), "neither physics made these data") &&
+              some_contain(remarks_of(spoilt, hopper, physics), "first in row 0; are they of hopper"));
     own.observations[5] = 10;  // row 0: a velocity at its limit
     CHECK(transition_differences(own, hopper, Physics::d4rl).size() < 200);
     own.actions.assign(own.actions.size(), NAN);
@@ -253,7 +287,7 @@ TEST(antmaze_of_minari_has_its_position_in_front) {
     CHECK(s[2] == 0.75f && s[3] == 1 && s[4] == 0);
     CHECK_EQUAL(rows.actions[3 * 8 + 7], -0.22215715f);
     CHECK(std::equal(s + 29, s + 58, &rows.next_observations[3 * 29]));
-    CHECK(some_contain(remarks_on(rows, task, "d4rl"), "the state is achieved_goal and observation"));
+    CHECK(some_contain(remarks_of(rows, task, "d4rl"), "the state is achieved_goal and observation"));
 }
 
 TEST(a_folder_of_minari_stands_for_its_file) {
@@ -268,7 +302,14 @@ TEST(a_folder_of_minari_stands_for_its_file) {
     const std::string arrow = made_file.folder + "/arrow";
     std::filesystem::create_directories(arrow + "/data/0");
     write_file_atomic(arrow + "/data/0/part-0.arrow", "ARROW1");
-    for (const char* below : {"", "/data", "/data/0"}) CHECK_FAILS("dataset.arrow", data_set_file(arrow + below));
+    for (const char* below : {"", "/data", "/data/0", "/data/0/part-0.arrow"})
+        CHECK_FAILS("dataset.arrow", data_set_file(arrow + below));
+    for (const auto& [path, name] : {std::pair("/x/own/a-v0/data/main_data.hdf5", "own-a-v0.hdf5"),
+                                     {"/x/hopper/medium-v0.1/main_data.hdf5", "hopper-medium-v0.1.hdf5"},
+                                     {"/a/main_data.hdf5", "main_data.hdf5"},
+                                     {"/data/main_data.hdf5", "main_data.hdf5"},
+                                     {"/x/own/data/a.hdf5", "a.hdf5"}})
+        CHECK_EQUAL(data_set_name(path), name);
 }
 
 // Cells of umaze's map: (1, 1) is the goal's, (2, 1) a wall; 0.2 lies between observed positions and cells.
@@ -312,18 +353,18 @@ TEST(data_of_other_bodies_are_named_before_training) {
     const MujocoTask &hopper = *find_mujoco_task("hopper"), &ant = *find_mujoco_task("ant");
     Rows rows;  // none, so that no step tells
     rows.state_dim = 11;
-    CHECK(remarks_on(rows, hopper, "d4rl").empty());
+    CHECK(remarks_of(rows, hopper, "d4rl").empty());
     rows.of_minari = true;
-    CHECK(some_contain(remarks_on(rows, hopper, "d4rl"), "if Gymnasium made the data"));
-    CHECK(remarks_on(rows, hopper, "2.2").empty());
-    CHECK(remarks_on(rows, *find_mujoco_task("antmaze-umaze-v2"), "d4rl").empty());
+    CHECK(some_contain(remarks_of(rows, hopper, "d4rl"), "if Gymnasium made the data"));
+    CHECK(remarks_of(rows, hopper, "2.2").empty());
+    CHECK(remarks_of(rows, *find_mujoco_task("antmaze-umaze-v2"), "d4rl").empty());
     rows.of_minari = false;
     rows.state_dim = 111;
     rows.observations.assign(222, 0);
     rows.observations[111 + 26] = 1;  // the last velocity
-    CHECK(remarks_on(rows, ant, "d4rl").empty());
+    CHECK(remarks_of(rows, ant, "d4rl").empty());
     rows.observations[111 + 27] = 1e-3f;
-    CHECK(some_contain(remarks_on(rows, ant, "2.2"), "contact forces"));
+    CHECK(some_contain(remarks_of(rows, ant, "2.2"), "contact forces"));
 }
 
 TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
@@ -359,6 +400,7 @@ TEST(trajectories_end_at_terminals_and_timeouts_and_a_tail_without_a_flag_is_non
     CHECK_EQUAL(shown(cut_at_flags(rows, 1000)), "0 1 2! | 3 4 5");
     const DataSetStatistics s = statistics_of(rows, cut_at_flags(rows, 1000));
     CHECK_EQUAL(s.left_out, size_t{2});
+    CHECK_EQUAL(statistics_of(rows, {}).returns.text(), "none");
     CHECK_EQUAL(s.terminated, size_t{1});
     CHECK_CLOSE(s.returns.mean(), (0 + 1 + 2 + 3 + 4 + 5) / 2.0, 1e-12);
     CHECK_CLOSE(s.returns.deviation(), 4.5, 1e-12);  // of 3 and 12
@@ -501,6 +543,11 @@ TEST(moves_are_whole_numbers_of_an_integer_type_or_with_one_above_one) {
     }
     rows.actions = {-1, 2};
     CHECK_FAILS("dataset.action", number_of_moves(rows, "f"));
+    rows.action_dim = 2;  // several choices a step, which clipping would spoil
+    rows.integer_actions = true;
+    CHECK_FAILS("dataset.action", number_of_moves(rows, "f"));
+    rows.actions = {-1, 1};
+    CHECK_EQUAL(number_of_moves(rows, "f"), 0);
 }
 
 TEST(the_data_of_the_grid_world_are_drawn_by_the_seed_of_the_data_alone) {

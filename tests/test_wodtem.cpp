@@ -338,6 +338,11 @@ TEST(bad_settings_are_usage_errors_that_name_the_nearest) {
     } catch (const Error& error) {
         CHECK(std::string(error.what()).find("nearest is 1") != std::string::npos);
     }
+    try {
+        set_setting(s, "alpha", "x");
+    } catch (const Error& error) {  // nothing is near what is no number
+        CHECK_EQUAL(error.what(), std::string("alpha cannot be \"x\"; it is a number from 0 to 1"));
+    }
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1186,6 +1191,8 @@ TEST(eval_is_the_runs_last_evaluation_unless_told_otherwise) {
     const Rows rows = read_data_set(open_hdf5(scratch / "made.hdf5"));
     CHECK_EQUAL(number_text(rows.count), number_text(3 * static_cast<int>(*to_number(last_row()[12]))));  // three alike
     CHECK(rows.state_dim == 2 && rows.action_dim == 1 && rows.ends(rows.count - 1) && rows.ends(rows.count / 3 - 1));
+    CHECK_EQUAL(open_hdf5(scratch / "made.hdf5").find("actions")->type, "int32");  // so that they are read as moves
+    CHECK(rows.integer_actions && number_of_moves(rows, "f") > 0);
     CHECK_EQUAL(std::count(rows.terminals.begin(), rows.terminals.end(), 1) +
                     std::count(rows.timeouts.begin(), rows.timeouts.end(), 1),
                 3);
@@ -1204,7 +1211,7 @@ std::string grid_file(const Scratch& scratch) {
     Settings settings = tiny_settings("wodtem");
     std::vector<Episode> episodes;
     for (Trajectory& trajectory : make_data_set(settings)) episodes.emplace_back().trajectory = std::move(trajectory);
-    write_episodes(scratch / "own.hdf5", episodes);
+    write_episodes(scratch / "own.hdf5", episodes, true);
     return scratch / "own.hdf5";
 }
 
@@ -1224,8 +1231,10 @@ Settings own_settings(const std::string& path, const std::string& method) {
     return settings;
 }
 
-// Continuous data: 6 trajectories of 5 steps, 2 state and 2 action numbers. Rewards are sevenths of `reward`.
-std::string continuous_file(const Scratch& scratch, float reward = 1) {
+// Continuous data: 6 trajectories of 5 steps, 2 state and 2 action numbers. Rewards are sevenths of `reward`. With
+// `beyond` the file is another one: the first action is 2, and the last trajectory does not end.
+std::string continuous_file(const Scratch& scratch, float reward = 1, bool beyond = false) {
+    const std::string path = scratch / (beyond ? "beyond.hdf5" : "continuous.hdf5");
     std::vector<float> states, actions, rewards;
     std::vector<uint8_t> terminals;
     for (int i = 0; i < 30; ++i) {
@@ -1235,13 +1244,14 @@ std::string continuous_file(const Scratch& scratch, float reward = 1) {
         rewards.push_back(x * reward);
         terminals.push_back(i % 5 == 4);
     }
-    Hdf5Writer out(scratch / "continuous.hdf5");
+    if (beyond) actions[0] = 2, terminals.back() = 0;
+    Hdf5Writer out(path);
     out.add("observations", {30, 2}, states);
     out.add("actions", {30, 2}, actions);
     out.add("rewards", {30}, rewards);
     out.add("terminals", {30}, terminals);
     out.close();
-    return scratch / "continuous.hdf5";
+    return path;
 }
 }  // namespace
 
@@ -1375,6 +1385,39 @@ TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
     check_shell("./wodtem sweep " + settings.dataset_path + " --seeds 3", 0, "own.hdf5 --method wodtem --preset small");
 }
 
+TEST(own_data_are_read_once_for_all_runs_and_what_is_changed_or_left_out_is_said_once) {
+    const Scratch scratch;
+    const std::string path = continuous_file(scratch, 1, true);
+    const Outcome outcome = shell("./wodtem train " + path + " --clip-actions --seeds 0-1 --methods dt,odt --out " +
+                                  scratch / "runs" + " --set offline_updates=2 --set batch_size=4");
+    CHECK_EQUAL(outcome.status, 0);
+    for (const char* sentence : {"1 of 60 numbers of actions lay beyond 1 and were clipped\n",
+                                 "the last 5 of 30 rows are not used: no end of a trajectory follows them\n"}) {
+        const size_t first = outcome.text.find(sentence);
+        CHECK(first != std::string::npos && outcome.text.find(sentence, first + 1) == std::string::npos);
+    }
+    CHECK(fs::exists(scratch / "runs/odt/seed-1/finished"));
+    CHECK(outcome.text.find("2 updates; no trajectory is held out, so nothing is measured") != std::string::npos);
+    CHECK(outcome.text.find("nan") == std::string::npos);
+    const Settings settings = own_settings(continuous_file(scratch), "odt");
+    quiet_train(settings, scratch / "with");
+    fs::remove(settings.dataset_path);  // it has been read
+    quiet_train(settings, scratch / "without");
+    CHECK(read_file(scratch / "with/model.safetensors") == read_file(scratch / "without/model.safetensors"));
+}
+
+// Minari's files are all called main_data.hdf5: runs have names after its folders.
+TEST(runs_on_folders_of_minari_are_called_after_them) {
+    const Scratch scratch;
+    for (const char* name : {"own/a-v0", "own/b-v0"}) {
+        fs::create_directories(scratch / name + "/data");
+        fs::copy_file(continuous_file(scratch), scratch / name + "/data/main_data.hdf5");
+        const std::vector<PlannedRun> runs = planned_runs(parse_arguments(commands[0], {scratch / name}));
+        CHECK_EQUAL(runs[0].folder, "runs/data-own-" + std::string(name).substr(4) + "-small-wodtem-0");
+        CHECK_EQUAL(runs[0].settings.dataset, "own-" + std::string(name).substr(4) + ".hdf5");
+    }
+}
+
 // A run that kept its state and goes on with a larger budget ends as one that had that budget from the start.
 TEST(a_larger_budget_goes_on_to_the_bytes_of_a_run_that_had_it_from_the_start) {
     const Scratch scratch;
@@ -1453,6 +1496,7 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     const std::string act = "./wodtem act " + scratch / "run ";
     CHECK_EQUAL(shell(act + scratch / "states").text, expected);
     CHECK_EQUAL(shell(act + "< " + scratch / "states").text, expected);
+    CHECK_EQUAL(shell("(printf '\\357\\273\\277'; cat " + scratch / "states) | " + act).text, expected);  // of UTF-8
     check_shell("echo 1,2,3,4 | " + act, 1, "line 1 of the input has 4 numbers; expected the 2 of a state");
     check_shell("printf '0,0\\n0,x\\n' | " + act, 1, "line 2 of the input: \"x\" is not a finite number");
     check_shell("echo 1e99,0 | " + act, 1, "is not a finite number");
@@ -2111,6 +2155,7 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     CHECK(six.find("episode 6: ") != std::string::npos);
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
+    CHECK(!fs::exists(scratch / "ant"));  // or a report would take it for an unfinished run
 
     const std::string nowhere = "D4RL_DATASET_DIR=" + (scratch / "none") + " ";
     if (!fs::exists(std::string(own_folder) + "/walker2d_medium_replay-v2.hdf5"))
@@ -2127,6 +2172,9 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     for (const auto& entry : fs::directory_iterator(scratch.path)) CHECK(entry.path().stem() != "x");
     check_shell("./wodtem collect --help", 0, "hopper-medium-replay-v2          402000  85,000 updates of 5 ms");
     check_shell("./wodtem collect maze2d-umaze --steps 0", 2, "nearest is 1");
+    for (const char* made_otherwise : {"maze2d-umaze", "hopper-medium-replay", "antmaze-walker"})
+        check_shell("./wodtem collect " + std::string(made_otherwise) + " --policy /none", 2, "leave --policy out");
+    check_shell("./wodtem collect antmaze-walker --steps 9", 2, "leave --steps out");
 }
 
 TEST(every_method_and_physics_trains_on_continuous_actions) {
@@ -2389,6 +2437,29 @@ TEST(weights_go_to_odt_and_back_byte_for_byte) {
                 "unknown \"transformer.wpe.weight\"");
     check_shell("./wodtem export " + scratch / "model.safetensors" + " " + odt, 2, "--odt");
     check_shell("./wodtem export --odt " + scratch / "plain.safetensors" + " " + odt, 1, "no model");
+    for (const char* option : {"--method dt", "--preset paper", "--set alpha=0.1", "--physics 2.2", "--dataset x"})
+        check_shell("./wodtem import " + odt + " " + back + " " + option, 2, "would change nothing");
+}
+
+// Without statistics in the file, a model of recorded data takes them from the data set that it was trained on.
+TEST(import_takes_missing_statistics_from_the_data_set_of_the_run) {
+    const Scratch scratch;
+    const std::string data = continuous_file(scratch), odt = scratch / "odt.safetensors", back = scratch / "back";
+    quiet_train(own_settings(data, "odt"), scratch / "run");
+    check_shell("./wodtem export --odt " + scratch / "run " + odt, 0, "strict load_state_dict");
+    TensorFile file = read_safetensors(odt), bare;
+    for (const StoredTensor& tensor : file.tensors)
+        if (tensor.dtype == DType::F32) bare.add(tensor.name, tensor.shape, file.get<float>(tensor.name, tensor.shape));
+    bare.metadata = file.metadata;
+    for (const char* name : {"state_mean", "state_std", "crc32.header", "crc32.tensors"}) bare.metadata.erase(name);
+    write_safetensors(odt, bare);
+    const std::string import = "./wodtem import " + odt + " " + back;
+    check_shell(import, 1, "has no state_mean and state_std; give the data set");
+    check_shell(import + " --dataset " + continuous_file(scratch, 1, true), 1, "is not the data set of " + odt);
+    check_shell(import + " --dataset " + scratch / "none.hdf5", 1, "none.hdf5");
+    check_shell(import + " --task data --dataset " + data, 2, "stands in the task's place");
+    check_shell(import + " --dataset " + data, 0, "data, odt");
+    CHECK(read_file(back) == read_file(scratch / "run/model.safetensors"));
 }
 
 // The Gaussian head has ODT's names too.
@@ -2572,6 +2643,16 @@ TEST(failures_exit_with_one_and_a_sentence) {
     check_shell("./wodtem train gridworld --out /proc/none", 1, "/proc/none");
     check_shell("(./wodtem tasks > /dev/full)", 1, "stdout");
     check_shell("./wodtem tasks", 0, "gridworld");
+    for (const auto& [task, dataset] : {std::pair("hopper-medium", "hopper_medium-v2.hdf5"), {"hopper", "none"}}) {
+        const std::string text = shell(std::string("./wodtem tasks ") + task).text;
+        const Settings settings = settings_from_text(text, "tasks");
+        CHECK_EQUAL(settings.dataset, dataset);
+        CHECK(settings.mujoco == mujoco_version() && settings.source.at("dataset").find("--dataset") < 60);
+        CHECK(text.starts_with("# Decided by options") && text.find("\ntask = ") < text.find("# Settings for --set") &&
+              text.find("\nlayers = ") > text.find("# Settings for --set"));
+    }
+    check_shell("./wodtem tasks " + grid_file(scratch), 0, "moves = 8 ");
+    check_shell("./wodtem eval " + scratch / "own.hdf5", 1, "is an HDF5 file, so a data set (see wodtem info)");
     check_shell("./wodtem train hopper", 1, "--dataset random");
     check_shell("./wodtem train gridworld --dataset x.hdf5", 2, "makes its own data set");
     check_shell("./wodtem sweep --precision fp16", 2, "--precision");

@@ -35,12 +35,8 @@ struct TraceLine {
     // The `count` numbers after `keyword`. Errors: trace.line says what is `expected`.
     std::vector<double> numbers(const std::string& keyword, int count, const std::string& expected) const {
         if (!text.starts_with(keyword)) refuse(expected);
-        std::vector<double> values;
-        for (const std::string& part : split(text.substr(keyword.size()), ',')) {
-            const std::optional<double> x = to_number(part);
-            if (!x) refuse(expected);
-            values.push_back(*x);
-        }
+        const std::vector<double> values =
+            numbers_between_commas<double>(text.substr(keyword.size()), [&](const std::string&) { refuse(expected); });
         if (values.size() != static_cast<size_t>(count)) refuse(expected);
         return values;
     }
