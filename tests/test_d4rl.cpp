@@ -151,6 +151,17 @@ TEST(episodes_of_minari_whose_numbers_have_gaps_are_all_read) {
         else
             CHECK_FAILS("dataset.column", read_minari(with_more));
     }
+    const auto says = [&](const std::map<std::string, uint64_t>& some, const std::string& end) {
+        try {
+            read_data_set(made_file.with(some, flags));
+            CHECK(!"read");
+        } catch (const Error& error) {
+            CHECK(error.id == "dataset.shape" && std::string(error.what()).ends_with(end));
+        }
+    };
+    std::map<std::string, uint64_t> fewer = columns;
+    fewer.erase("episode_7/rewards");
+    says(fewer, "\"episode_7/rewards\"; in Minari's layout each episode has it");
     columns["episode_3/infos/x"] = 1;  // an episode of which a part is missing
     CHECK_FAILS("dataset.shape", read_minari(made_file.with(columns, flags)));
     columns.erase("episode_3/infos/x");
@@ -390,6 +401,14 @@ TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
             CHECK(std::string(error.what()).find("\"" + std::string(name) + "\": has a row for each") !=
                   std::string::npos);
         }
+    }
+    try {
+        read_rows(made_file.with({{"ep_0/observations", 6}}, {}));
+        CHECK(!"read");
+    } catch (const Error& error) {
+        CHECK(std::string(error.what())
+                  .ends_with("it is in neither D4RL's layout nor Minari's "
+                             "(episode_0/observations)"));
     }
     // Of another length, or below a group, it is no column of the table.
     read_rows(made_file.with(columns, {{"terminals", terminals}, {"version", {1}}, {"infos/dones", ends}}));
