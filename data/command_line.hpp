@@ -543,8 +543,7 @@ inline void print_settings(const Arguments& arguments) {
     if (find_mujoco_task(settings.task)) {
         const PublishedDataSet* published = find_published(settings.task);
         if (published) settings.dataset = file_name(*published);
-        settings.source["dataset"] = published ? "looked for in D4RL's folder and runs/datasets; or see --dataset"
-                                               : "no data set has this name: see --dataset";
+        settings.source["dataset"] = "the task's, if it is named after one; or see --dataset";
         settings.mujoco = mujoco_version();
     }
     for (const bool for_set : {false, true}) {
