@@ -96,10 +96,9 @@ constexpr const char* own_folder = "runs/datasets";
 inline std::string data_set_file(const std::string& given) {
     for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
         if (is_there(given + file)) return given + file;
-    const bool arrow = std::ranges::any_of(std::array{"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow"},
-                                           [&](const char* file) { return is_there(given + file); });
-    require(!arrow && !given.ends_with(".arrow"), "dataset.arrow", given,
-            ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
+    for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow", ""})
+        require(!(given + file).ends_with(".arrow") || !is_there(given + file), "dataset.arrow", given,
+                ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
     return given;
 }
 

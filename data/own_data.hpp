@@ -59,14 +59,12 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
 }
 
 void print_held_out(const Run& run, const std::string& path, const HeldOut& held_out, size_t trajectories) {
-    if (trajectories == 0) {
-        std::printf("%s: %s updates; no trajectory is held out, so nothing is measured\n", path.c_str(),
-                    number_text(run.progress.updates).c_str());
-        return;
-    }
+    const std::string updates = number_text(run.progress.updates);
+    if (trajectories == 0)
+        return void(std::printf("%s: %s updates; no trajectory is held out, so nothing is measured\n", path.c_str(),
+                                updates.c_str()));
     std::printf("%s: %s updates; %zu trajectories held out: log-probability of an action %s, %s %s\n", path.c_str(),
-                number_text(run.progress.updates).c_str(), trajectories,
-                number_text(static_cast<float>(held_out.log_prob)).c_str(),
+                updates.c_str(), trajectories, number_text(static_cast<float>(held_out.log_prob)).c_str(),
                 run.agent.discrete() ? "share of other moves" : "squared error of the mean",
                 number_text(static_cast<float>(held_out.error)).c_str());
 }
@@ -136,7 +134,7 @@ inline std::string act_help() {
 
 // The numbers of a line. Errors: act.line.
 std::vector<double> numbers_of_line(const std::string& line, size_t number, size_t state_dim) {
-    std::vector<double> values = numbers_between_commas<float>(line, [&](const std::string& part) {
+    std::vector<double> values = numbers_between_commas(line, [&](const std::string& part) {
         throw Error("act.line",
                     text_of("line ", number, " of the input: \"", part.substr(0, 40), "\" is not a finite number"));
     });

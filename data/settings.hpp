@@ -63,15 +63,13 @@ inline std::optional<double> to_number(const std::string& text) {
     return x;
 }
 
-// The numbers of a line, separated by commas and perhaps blanks, of which each must be finite as a Number. refuse(part)
-// throws, for a part that is none.
-template <class Number>
-std::vector<double> numbers_between_commas(const std::string& line, const auto& refuse) {
+// The numbers of a line, between commas and perhaps blanks, which are finite also as float32, the type of states and
+// actions. refuse(part) throws, for a part that is none.
+inline std::vector<double> numbers_between_commas(const std::string& line, const auto& refuse) {
     std::vector<double> values;
     for (const std::string& part : split(line, ',')) {
-        const std::optional<double> x = to_number(trimmed(part));
-        if (!x || !std::isfinite(static_cast<Number>(*x))) refuse(part);
-        values.push_back(*x);
+        values.push_back(to_number(trimmed(part)).value_or(NAN));
+        if (!std::isfinite(static_cast<float>(values.back()))) refuse(part);
     }
     return values;
 }

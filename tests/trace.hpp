@@ -36,7 +36,7 @@ struct TraceLine {
     std::vector<double> numbers(const std::string& keyword, int count, const std::string& expected) const {
         if (!text.starts_with(keyword)) refuse(expected);
         const std::vector<double> values =
-            numbers_between_commas<double>(text.substr(keyword.size()), [&](const std::string&) { refuse(expected); });
+            numbers_between_commas(text.substr(keyword.size()), [&](const std::string&) { refuse(expected); });
         if (values.size() != static_cast<size_t>(count)) refuse(expected);
         return values;
     }
