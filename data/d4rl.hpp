@@ -630,11 +630,41 @@ inline size_t rows_in_none(const Rows& rows, const std::vector<Trajectory>& traj
     return left;
 }
 
-// Says that the last rows are dropped, if some are.
-inline void print_tail(const Rows& rows, const std::vector<Trajectory>& trajectories, const std::string& path) {
-    if (const size_t left = rows_in_none(rows, trajectories); left > 0)
+// Returns a sentence on the first column with an observation so far from all others that these, once normalised, are
+// nearly one number: it makes 99% of the sum of squared deviations alone. "": there is none, or few rows.
+inline std::string remark_on_outliers(const Rows& rows) {
+    struct Column {
+        double sum = 0, squares = 0, largest = 0;
+        size_t farthest = 0;
+    };
+    std::vector<Column> columns(rows.state_dim);
+    const auto for_each_number = [&](auto&& f) {
+        for (size_t i = 0; i < rows.count * rows.state_dim; ++i)
+            f(columns[i % rows.state_dim], double{rows.observations[i]}, i / rows.state_dim);
+    };
+    for_each_number([](Column& column, double x, size_t) { column.sum += x; });
+    for_each_number([&](Column& column, double x, size_t row) {
+        const double deviation = x - column.sum / static_cast<double>(rows.count), square = deviation * deviation;
+        column.squares += square;
+        if (square > column.largest) column.largest = square, column.farthest = row;
+    });
+    for (size_t i = 0; i < columns.size() && rows.count > 1000; ++i)
+        if (columns[i].largest > 0.99 * columns[i].squares)
+            return text_of(
+                "\"observations\", row ", columns[i].farthest, ", column ", i, " is ",
+                rows.observation(columns[i].farthest)[i],
+                ", so far from all others that these are nearly one number once normalised: is it an error?");
+    return "";
+}
+
+// Says which rows are dropped or drown all others, if some are. cut_by_flags: rows after the last flag are in none.
+inline void print_remarks(const Rows& rows, const std::vector<Trajectory>& trajectories, const std::string& path,
+                          bool cut_by_flags) {
+    if (const size_t left = rows_in_none(rows, trajectories); left > 0 && cut_by_flags)
         std::fprintf(stderr, "%s: the last %zu of %zu rows are not used: no end of a trajectory follows them\n",
                      path.c_str(), left, rows.count);
+    if (const std::string remark = remark_on_outliers(rows); !remark.empty())
+        std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
 }
 
 // Clips the finite actions to [-1, 1] and says how many it changed.
@@ -667,7 +697,7 @@ inline std::vector<Trajectory> load_data_set(const std::string& path, const Mujo
         remarks_on(rows, task, settings.physics, transitions_of_each_physics(rows, task));
     if (!places.empty()) remarks.push_back(places);
     for (const std::string& remark : remarks) std::fprintf(stderr, "%s: %s\n", path.c_str(), remark.c_str());
-    if (task.rules != Rules::antmaze) print_tail(rows, trajectories, path);
+    print_remarks(rows, trajectories, path, task.rules != Rules::antmaze);
     return trajectories;
 }
 
@@ -711,7 +741,7 @@ inline OwnData load_own_data(const std::string& path, bool clip) {
     for (const Trajectory& trajectory : data.trajectories)
         require(trajectory.rewards.size() <= INT32_MAX / width, "dataset.shape", path, ": a trajectory has ",
                 trajectory.rewards.size(), " steps of ", width, " numbers; the most is 2^31 numbers");
-    print_tail(rows, data.trajectories, path);
+    print_remarks(rows, data.trajectories, path, true);
     return data;
 }
 

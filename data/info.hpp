@@ -67,6 +67,7 @@ inline void print_data_set(const std::string& path, std::string id) {
         for (const std::string& remark : remarks_on(rows, *task, "d4rl", transitions))
             std::printf("note: %s\n", remark.c_str());
     }
+    if (const std::string remark = remark_on_outliers(rows); !remark.empty()) std::printf("note: %s\n", remark.c_str());
     print_published(find_published(id));
 }
 

@@ -540,6 +540,21 @@ TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
                 "dataset.not_finite f: \"actions\", row 0, column 0 is nan; only finite numbers can be learned from");
 }
 
+TEST(an_observation_that_would_drown_all_others_is_named) {
+    Rows rows;
+    rows.count = 2000, rows.state_dim = 2;
+    for (size_t i = 0; i < 4000; ++i) rows.observations.push_back(static_cast<float>(i * 7 % 13));
+    CHECK_EQUAL(remark_on_outliers(rows), "");
+    rows.observations[2 * 1500 + 1] = 12000;
+    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 1500, column 1 is 12000, so far from all"));
+    rows.observations[2 * 1500 + 1] = 200;
+    CHECK_EQUAL(remark_on_outliers(rows), "");
+    rows.observations[2 * 7] = -1e38f;
+    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 7, column 0 is -1e+38, so far from all"));
+    for (size_t row = 0; row < 2000; ++row) rows.observations[2 * row] = 3;  // a dead column has none
+    CHECK_EQUAL(remark_on_outliers(rows), "");
+}
+
 TEST(rows_of_another_size_or_without_an_end_are_refused) {
     const MujocoTask& hopper = *find_mujoco_task("hopper");
     CHECK_FAILS("dataset.task", cut_trajectories(made({1, 2}, {0, 1}, {}), hopper, "f"));
