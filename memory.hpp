@@ -1,12 +1,13 @@
-// memory.hpp: what the agent remembers: trajectories and their returns, the replay buffer D, the episodic memory Q.
+// memory.hpp: trajectories and their returns, environments and episodes, the replay buffer D, the episodic memory Q.
 //   sec. III-A      g_t and d_t                     returns_to_go, discounted_returns, relabel
 //   sec. III-A      D_offline, D_online             offline_set, ReplayBuffer
-//   sec. IV-B.1     the table Q, eq. (4)            EpisodicMemory::update    (the paper's rule between (3) and (5))
+//   sec. III-B      interaction                     Environment, Episode, play
+//   sec. IV-B.1     the table Q, eq. (4)            EpisodicMemory::update_one (the paper's rule between (3) and (5))
 //   sec. IV-B.2     K(s_q), eqs. (5) and (6)        nearest, search, is_optimal, advised_action
 //   sec. IV-B.3     eq. (7)                         weight
 // Promises: exact nearest neighbours; every tie has a stated winner, so results depend on the order of updates and
 // look-ups and on nothing else (not on when the search tree was built, not on a save and load in between); a refused
-// trajectory leaves the table as it was. Leaves out: networks, files, threads (many threads may call search() at once).
+// trajectory leaves the table as it was; many threads may call search() at once. Leaves out: networks, files.
 //
 // Memory per entry, with projected_dim 4 and action_dim 8: 88 bytes are saved (key 16, projected state 16, action 32,
 // e 8, priority 8, age 8); the hash table, the eviction heap and the search tree are derived from them and take about
@@ -22,7 +23,7 @@
 
 // The streams of random numbers beside those of nn.hpp. The values are part of the format of a run; never renumber.
 namespace Stream {
-constexpr uint32_t batch = 3;           // step: update; index: window of the batch; site 1: Draw::uniform's start
+constexpr uint32_t batch = 3;           // step: update; index: window of the batch; site 1: the start, if uniform
 constexpr uint32_t exploration = 4;     // step: episode; site: action dimension; index: time-step
 constexpr uint32_t advised_action = 5;  // eq. (6). step: update; index: window * context_length + step in the window
 constexpr uint32_t entropy_noise = 6;   // the same; site: action dimension
@@ -81,11 +82,13 @@ inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, doubl
 }
 
 // WODTEM sec. III-A: the total return is g_1.
+// g_0, the undiscounted return. Errors: memory.not_relabelled.
 inline double total_return(const Trajectory& trajectory) {
     if (trajectory.returns_to_go.empty()) fail("memory.not_relabelled", "a trajectory has no returns: relabel it");
     return trajectory.returns_to_go.front();
 }
 
+// Orders trajectories by total return.
 inline bool lower_return(const Trajectory& a, const Trajectory& b) { return total_return(a) < total_return(b); }
 
 // ODT's loop that keeps trajectories, best first, stops one short: exactly the lowest-return one is dropped, unless it
@@ -120,12 +123,12 @@ struct Environment {
     // Begins an episode and writes its first state [state_dim], which is a function of (random, episode).
     virtual void reset(const Random& random, uint64_t episode, float* state) = 0;
     // Takes an action [action_dim] and writes the state [state_dim] that follows. Errors: environment.unstable where
-    // the simulation broke down; the caller must then drop the episode.
+    // the simulation broke down; the caller must then drop the episode. Any other error ends the run.
     virtual Step step(const float* action, float* state) = 0;
     virtual std::unique_ptr<Environment> clone() const = 0;
 };
 
-// An episode while it is played, and afterwards.
+// One episode: the steps made so far and the present state.
 struct Episode {
     uint64_t number = 0;         // which decides its first state and all its random numbers
     Trajectory trajectory;       // the steps made so far, without returns
@@ -137,8 +140,8 @@ struct Episode {
     std::string error;           // the sentence of environment.unstable, else empty
     std::exception_ptr thrown;   // what step() caught, for take_error() to throw in the caller's thread
 
-    // Takes one step of the environment, whose state this episode's is. Throws nothing; the caller's thread then calls
-    // take_error().
+    // Takes one step of the environment, which must be in the state that this episode holds. Throws nothing; the
+    // caller's thread then calls take_error().
     void step(Environment& environment, const float* action, int action_dim) {
         reward = 0;
         try {
@@ -157,7 +160,7 @@ struct Episode {
         total_reward += reward;
     }
 
-    // Notes that the simulation broke down in step(). Errors: any other that it met.
+    // Moves the sentence of environment.unstable that step() met to `error`. Errors: any other that it met.
     void take_error() {
         try {
             if (thrown) std::rethrow_exception(std::exchange(thrown, nullptr));
@@ -181,7 +184,8 @@ struct Environments {
 };
 
 // Plays one episode in each environment, numbered from `first` on, in lockstep up to termination or the time limit.
-// choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over.
+// choose(running) returns the actions [running.size(), action_dim] of the episodes that are not over. Errors: what
+// reset() throws, and take_error().
 std::vector<Episode> play(std::span<Environment* const> environments, const Random& resets, uint64_t first,
                           auto&& choose, Threads* threads) {
     const EnvironmentSpec spec = environments[0]->spec();
@@ -224,7 +228,7 @@ struct Window {
 // How a trajectory is drawn from the buffer: with probability proportional to its length, as DT's and ODT's code, or
 // each alike, as min-decision-transformer. The paper does not say. Drawn alike, a step of a trajectory of T steps
 // counts 1 / T, so that short episodes weigh more.
-enum class Draw { by_length, uniform };
+enum class Sampling { by_length, uniform };
 
 struct ReplayBuffer {
     int state_dim, action_dim;
@@ -255,6 +259,7 @@ struct ReplayBuffer {
         count_steps();
     }
 
+    // Computes `ends` anew, after any change of `trajectories`.
     void count_steps() {
         ends.clear();
         uint64_t steps = 0;
@@ -266,9 +271,11 @@ struct ReplayBuffer {
     // departs from the paper: as ODT's code does, not the latest C steps up to t, which are short at the beginning.
     // by_length: one number drawn from all steps laid end to end has exactly these probabilities, for each step is one
     // start. uniform: a second number, of site 1, draws the start.
-    Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length, Draw draw) const {
+    Window sample(const Random& random, uint64_t update, uint32_t window_index, int context_length,
+                  Sampling sampling) const {
         if (trajectories.empty()) fail("replay.empty", "cannot sample: the replay buffer holds no trajectory");
-        if (draw == Draw::by_length) return window_at(random.below(ends.back(), update, window_index), context_length);
+        if (sampling == Sampling::by_length)
+            return window_at(random.below(ends.back(), update, window_index), context_length);
         const size_t drawn = random.below(trajectories.size(), update, window_index);
         const uint64_t length = trajectories[drawn].rewards.size(), first = ends[drawn] - length;
         return window_at(first + random.below(length, update, window_index, 1), context_length);
@@ -324,20 +331,20 @@ struct Points {
 // take O(log(n)^2) amortised, whatever their order. No result depends on the tree's shape.
 struct KdTree {
     static constexpr uint32_t lanes = 16;         // entries in a full leaf
-    static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `dim` in a leaf
-    static constexpr size_t longest_path = 48;    // planes above a leaf: log(2^31 / 9) / log(3/2) = 47.6, and the last
+    static constexpr uint32_t leaf = 0xFFFFFFFF;  // stands for `axis` in a leaf
+    static constexpr size_t longest_path = 48;  // planes above a leaf: 2/3 (rounded up) of 2^31 - 1 is 8 after 48 times
     template <class Number>
-    struct alignas(64) Lanes : std::array<Number, lanes> {};
+    struct alignas(64) LeafArray : std::array<Number, lanes> {};
     struct Node {
         uint32_t child;  // inner node: its low child, the high child follows it. Leaf: its place in the arrays below
-        uint32_t dim;
-        float split;     // inner node: the high child's entries begin at (split, numbers[node]) in the order above
+        uint32_t axis;   // inner node: the dimension that divides its entries
+        float split;     // inner node: the high child's entries begin at (split, split_entry[node]) in the order above
         uint32_t count;  // entries below it, or in the leaf
     };
-    std::vector<Node> nodes;                // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
-    std::vector<uint32_t> numbers;          // [node]
-    std::vector<Lanes<float>> coordinates;  // [place, dim]
-    std::vector<Lanes<uint32_t>> entries;   // [place] there is one place for each pair
+    std::vector<Node> nodes;                    // nodes 2 p and 2 p + 1, a pair, are siblings; node 0 is the root
+    std::vector<uint32_t> split_entry;          // [node] the entry that the plane goes through
+    std::vector<LeafArray<float>> coordinates;  // [place, dim]
+    std::vector<LeafArray<uint32_t>> entries;   // [place] there is one place for each pair
     std::vector<uint32_t> free_pairs;
 
     // Makes a node of the entries in `order`: halves them along the dimension of the largest extent until they fit
@@ -357,20 +364,21 @@ struct KdTree {
             }
             widest = std::max(widest, {most - least, d});
         }
-        const uint32_t dim = widest.second, pair = take_pair(points.dim);
+        const uint32_t axis = widest.second, pair = take_pair(points.dim);
         const auto half = order.begin() + static_cast<ptrdiff_t>(order.size() / 2);
-        std::ranges::nth_element(order, half, {}, [&](uint32_t i) { return std::pair(points.at(i, dim), i); });
-        nodes[node] = {2 * pair, dim, points.at(*half, dim), nodes[node].count};
-        numbers[node] = *half;
+        std::ranges::nth_element(order, half, {}, [&](uint32_t i) { return std::pair(points.at(i, axis), i); });
+        nodes[node] = {2 * pair, axis, points.at(*half, axis), nodes[node].count};
+        split_entry[node] = *half;
         build_node(points, 2 * pair, place, {order.begin(), half});
         build_node(points, 2 * pair + 1, pair, {half, order.end()});
     }
 
+    // A free pair of nodes and its place for a leaf; enlarges the arrays if there is none. dim: of the points.
     uint32_t take_pair(size_t dim) {
         if (free_pairs.empty()) {
             free_pairs.push_back(static_cast<uint32_t>(entries.size()));
             nodes.resize(nodes.size() + 2);
-            numbers.resize(nodes.size());
+            split_entry.resize(nodes.size());
             coordinates.resize(coordinates.size() + dim);
             entries.emplace_back();
         }
@@ -379,6 +387,7 @@ struct KdTree {
         return pair;
     }
 
+    // Writes an entry into one lane of the leaf at `place`.
     void put(const Points& points, size_t place, size_t lane, uint32_t entry) {
         entries[place][lane] = entry;
         for (size_t d = 0; d < points.dim; ++d) coordinates[place * points.dim + d][lane] = points.at(entry, d);
@@ -388,10 +397,10 @@ struct KdTree {
     // leaf change by `change`, which they do; where none does, the leaf again.
     std::pair<uint32_t, uint32_t> descend(const Points& points, uint32_t entry, int change) {
         uint32_t at = 0, highest = no_entry;
-        while (nodes[at].dim != leaf) {
+        while (nodes[at].axis != leaf) {
             const uint32_t count = nodes[at].count += change;
-            const float x = points.at(entry, nodes[at].dim);
-            const bool high = x == nodes[at].split ? entry >= numbers[at] : x > nodes[at].split;
+            const float x = points.at(entry, nodes[at].axis);
+            const bool high = x == nodes[at].split ? entry >= split_entry[at] : x > nodes[at].split;
             const uint32_t next = nodes[at].child + high;
             const uint32_t heavier = std::max(nodes[next].count + change, nodes[next ^ 1].count);
             if (highest == no_entry && (count <= lanes / 2 || heavier > count - count / 3)) highest = at;
@@ -400,15 +409,17 @@ struct KdTree {
         return {at, highest == no_entry ? at : highest};
     }
 
+    // Adds an entry whose row `points` holds already.
     void insert(const Points& points, uint32_t entry) {
         const auto [at, highest] = descend(points, entry, 1);
         if (highest == at && nodes[at].count < lanes) return put(points, nodes[at].child, nodes[at].count++, entry);
         rebuild(points, highest, {entry});
     }
 
+    // Takes an entry out; its row must be the one that it was inserted with.
     void remove(const Points& points, uint32_t entry) {
         const auto [at, highest] = descend(points, entry, -1);
-        const Lanes<uint32_t>& held = entries[nodes[at].child];
+        const LeafArray<uint32_t>& held = entries[nodes[at].child];
         const auto lane = std::ranges::find(held, entry) - held.begin();
         put(points, nodes[at].child, lane, held[--nodes[at].count]);
         if (highest != at) rebuild(points, highest, {});
@@ -423,7 +434,7 @@ struct KdTree {
     // Appends the entries below a node to `order`, frees the pairs below, and returns the place that the node got.
     uint32_t collect(uint32_t index, std::vector<uint32_t>& order) {
         const Node node = nodes[index];
-        if (node.dim == leaf) {
+        if (node.axis == leaf) {
             order.insert(order.end(), entries[node.child].begin(), entries[node.child].begin() + node.count);
             return node.child;
         }
@@ -435,13 +446,13 @@ struct KdTree {
 
 // A query on its way through a tree.
 struct Walk {
-    size_t query;          // its number
+    size_t query;          // its index among the queries
     const float* point;    // [dim]
     uint32_t skipped;      // the entry that is no neighbour
     float reach;           // an entry farther away is none either
     uint32_t at = 0;       // the node to be visited next
-    bool fetched = false;  // if that is a leaf: whether it has been prefetched
-    size_t waiting = 0;    // subtrees to be visited then, the last one first: (squared distance to its plane, node)
+    bool fetched = false;  // if `at` is a leaf: whether it has been prefetched
+    size_t waiting = 0;    // height of the stack of subtrees still to be visited: (squared distance to the plane, node)
     std::array<std::pair<float, uint32_t>, KdTree::longest_path> subtrees = {};
 
     // Visits one node; returns whether there is another to visit. A subtree beyond a plane can be left out if the plane
@@ -449,8 +460,8 @@ struct Walk {
     // the difference, in its square and in a sum of squares. At equal distances the older entry wins: hence not >=.
     ALWAYS_INLINE bool step(const KdTree& tree, const Points& points, Neighbourhoods& found) {
         const KdTree::Node& node = tree.nodes[at];
-        if (node.dim != KdTree::leaf) {
-            const float gap = point[node.dim] - node.split;
+        if (node.axis != KdTree::leaf) {
+            const float gap = point[node.axis] - node.split;
             at = node.child + (gap > 0.0f);
             subtrees[waiting++] = {gap * gap, at ^ 1};
             __builtin_prefetch(&tree.nodes[at]);
@@ -472,7 +483,7 @@ struct Walk {
     // Takes those entries of a leaf that are among the K nearest so far.
     // WODTEM sec. IV-B.2, q: q(s_q, s_k) = ||s_q - s_k||^2, not its root; of all entries of the leaf at once.
     ALWAYS_INLINE void scan(const KdTree& tree, const KdTree::Node& node, const Points& points, Neighbourhoods& found) {
-        KdTree::Lanes<float> distance = {};
+        KdTree::LeafArray<float> distance = {};
         for (size_t d = 0; d < points.dim; ++d)
 #pragma GCC unroll 1  // vectors of lanes, not of dimensions
             for (size_t i = 0; i < KdTree::lanes; ++i) {
@@ -504,14 +515,14 @@ struct MemoryConfig {
     size_t capacity;            // entries
     int K;                      // neighbours
     double epsilon;             // bound on the squared distance
-    double tau = 1.0;           // temperature of eq. (6); the paper has none, which is 1
+    double tau = 1.0;           // divides e in eq. (6)'s softmax; the paper has none, which is 1
     bool exclude_self = false;  // the entry of the query state itself is no neighbour
     Eviction eviction = Eviction::lfu;
 };
 
 // "Exact state matching": two states are one when their float32 bits agree, -0 taken as +0. The key is 128 bits, each
 // group of four numbers folded in by a permutation: h = philox(h xor group). Up to 4 dimensions nothing can collide;
-// beyond, n states share a key by chance with probability n^2 / 2^129: 2e-26 for 4e6. (No defence against an enemy.)
+// beyond, n states share a key by chance with probability n^2 / 2^129: 2e-26 for 4e6. It does not resist an adversary.
 inline Words4 state_key(const float* state, size_t state_dim) {
     Words4 h = {};
     for (size_t i = 0; i < state_dim; ++i) {
@@ -552,7 +563,8 @@ struct EpisodicMemory {
         if (c.state_dim < 1 || c.action_dim < 1 || c.K < 1 || c.projected_dim < 0 || c.capacity < 1 ||
             c.capacity > 0x7FFFFFFF || !(c.epsilon >= 0.0) || !(c.tau > 0.0))
             fail("memory.config",
-                 "episodic memory needs state_dim, action_dim, K, capacity >= 1, projected_dim, epsilon >= 0, tau > 0; "
+                 "episodic memory needs state_dim, action_dim, K >= 1, capacity from 1 to 2^31 - 1, projected_dim, "
+                 "epsilon >= 0, tau > 0; "
                  "got %d, %d, %d, %zu, %d, %g, %g",
                  c.state_dim, c.action_dim, c.K, c.capacity, c.projected_dim, c.epsilon, c.tau);
         // WODTEM sec. IV-B.1, projection: random, from R^F to R^F1. Variance 1 / F1 keeps the expected squared
@@ -692,31 +704,23 @@ struct EpisodicMemory {
 
     // WODTEM sec. IV-B.2, K(s_q): {(s_k, a_k^e, e_k) : q(s_q, s_k) < epsilon, 1 <= k <= K}, closest first, for
     // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. limit: reach(), the largest
-    // distance of a neighbour. The K closest of those within epsilon are those within epsilon of the K closest.
+    // distance of a neighbour. Several walks take one step each in turn, so that the next node of a walk can come from
+    // memory while the others compute. The K closest of those within epsilon are those within epsilon of the K closest.
     // The tests hold this to a scan of all entries.
     Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
-        std::vector<Walk> walks;
-        walks.reserve(walks_side_by_side);
-        search_tree(at, skipped, limit, walks, found);
-        return found;
-    }
-
-    // Several walks take one step each in turn, so that the next node of a walk can come from memory while the others
-    // compute. walks: empty, with room for walks_side_by_side, so that push_back() allocates nothing.
-    static constexpr size_t walks_side_by_side = 16;
-    EACH_TARGET void search_tree(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit,
-                                 std::vector<Walk>& walks, Neighbourhoods& found) const {
-        for (size_t begun = 0; begun < skipped.size() || !walks.empty();) {
-            for (; begun < skipped.size() && walks.size() < walks_side_by_side; ++begun)
-                walks.push_back({begun, &at[begun * dim], skipped[begun], limit});
-            for (size_t i = walks.size(); i-- > 0;) {
-                if (walks[i].step(tree, points(), found)) continue;
-                walks[i] = walks.back();
-                walks.pop_back();
+        std::array<Walk, 16> walks;
+        const Points p = points();
+        vectorised<float>([&](auto) INLINE_LAMBDA {
+            for (size_t begun = 0, active = 0; begun < n || active > 0;) {
+                for (; begun < n && active < walks.size(); ++begun)
+                    walks[active++] = {begun, &at[begun * dim], skipped[begun], limit};
+                for (size_t i = active; i-- > 0;)
+                    if (!walks[i].step(tree, p, found)) walks[i] = walks[--active];
             }
-        }
+        });
+        return found;
     }
 
     // The largest float below epsilon: distances are floats, so q <= reach() says q < epsilon.

@@ -10,21 +10,10 @@
 // Needs MuJoCo 2.2 (Debian: libmujoco-dev). Without it the table of tasks remains, and WODTEM_MUJOCO is not defined.
 #pragma once
 
-#include <algorithm>
-#include <array>
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <limits>
-#include <memory>
 #include <optional>
-#include <span>
-#include <string>
 #include <string_view>
-#include <vector>
 
-#include "memory.hpp"
-#include "nn.hpp"
+#include "memory.hpp"  // and with it nn.hpp and the other standard headers
 
 #if __has_include(<mujoco/mujoco.h>) && !defined(WODTEM_WITHOUT_MUJOCO)
 #include <mujoco/mujoco.h>
@@ -382,8 +371,9 @@ struct MujocoEnvironment : Environment {
         const double forward = (x_position() - x_before) / step_time();  // mean velocity along x, m/s
         const double alive = task->rules == Rules::halfcheetah ? 0 : 1;  // per step, the last one too
         const double control_cost = task->control_cost * squares;        // of the clipped action
-        const double contact_cost = task->rules == Rules::ant ? 0.0005 * squared_contact_forces() : 0;  // is 0
-        return forward + alive - control_cost - contact_cost;
+        // gym's ant also pays 0.0005 per squared contact force, cfrc_ext, which is always 0: mj_step computes it for
+        // sensors alone, which the model does not have, and neither gym nor D4RL's collection computed it.
+        return forward + alive - control_cost;
     }
 
     // Comparisons are written so that NaN terminates, as in gym.
@@ -424,17 +414,6 @@ struct MujocoEnvironment : Environment {
 
     double distance_to_goal() const { return std::hypot(data->qpos[0] - goal[0], data->qpos[1] - goal[1]); }
 
-    // Always 0: mj_step computes cfrc_ext [bodies x 6] only for sensors, which the model does not have, and neither gym
-    // nor D4RL's collection computed it.
-    double squared_contact_forces() const {
-        double sum = 0;
-        for (int i = 0; i < 6 * model->nbody; ++i) {
-            const double force = std::clamp(data->cfrc_ext[i], -1.0, 1.0);
-            sum += force * force;
-        }
-        return sum;
-    }
-
     bool all_finite() const {
         const auto finite = [](double x) { return std::isfinite(x); };
         return std::all_of(data->qpos, data->qpos + model->nq, finite) &&
@@ -463,10 +442,19 @@ struct MujocoEnvironment : Environment {
     // mujoco-py made every warning of the engine an exception, and D4RL's collection dropped the episode. By itself the
     // engine resets the state and goes on. Errors: environment.unstable.
     void check_engine() const {
+        // Not mju_warningText(), which writes to one static buffer: episodes take their steps at the same time.
+        constexpr const char* texts[mjNWARNING] = {"the inertia matrix is nearly singular at DOF",
+                                                   "too many contacts for a buffer of",
+                                                   "too many constraints for a buffer of",
+                                                   "too many visual geoms for a buffer of",
+                                                   "bad number in qpos at DOF",
+                                                   "bad number in qvel at DOF",
+                                                   "bad number in qacc at DOF",
+                                                   "bad number in control"};
         for (int i = 0; i < mjNWARNING; ++i)
             if (data->warning[i].number > 0)
-                fail("environment.unstable", "%s: step %d: MuJoCo: %s", task->name, steps,
-                     mju_warningText(i, data->warning[i].lastinfo));
+                fail("environment.unstable", "%s: step %d: MuJoCo: %s %d", task->name, steps, texts[i],
+                     data->warning[i].lastinfo);
         if (!all_finite())
             fail("environment.unstable", "%s: step %d: a position or velocity is not finite", task->name, steps);
     }

@@ -1,7 +1,7 @@
-// nn.hpp: everything numerical that a decision transformer needs, and nothing about reinforcement learning.
+// nn.hpp: everything numerical that a decision transformer needs.
 //
 //   Errors         Error, fail
-//   Chance         philox, Random, Stream: numbers by counter
+//   Random numbers philox, Random, Stream: counter-based
 //   Threads        Threads: a job shared out in numbered tasks
 //   Vector code    vectorised, Vector, lanes_at
 //   Products       View, matmul_plain (the definition); Kernel, compute_tile; matmul (the fast version); dot
@@ -14,7 +14,7 @@
 //
 // Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
 // number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
-// Leaves out: anything that knows what a return, an episode, a file or an option is.
+// Leaves out: how returns are computed; episodes, environments, files, options.
 #pragma once
 
 #include <algorithm>
@@ -300,15 +300,6 @@ N divide_up(N n, std::type_identity_t<N> by) {
 // Vector code. The loops that cost most are compiled once for each generation of x86 processors, for float; double,
 // which only checks, has the portable version alone. Every operation is rounded by itself (-ffp-contract=off), and the
 // order of additions is written out, so all versions give the same bits.
-
-// For functions that stand by themselves: the compiler makes the versions, and chooses when the program starts. (The
-// sanitizers cannot start with it.) No exception may leave such a function: with GCC 12 it ends the process even if
-// a caller has a handler. What may throw, an allocation say, is done before.
-#if defined(X86_KERNELS) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
-#define EACH_TARGET __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#else
-#define EACH_TARGET
-#endif
 
 template <int Count>
 using Lanes = std::integral_constant<int, Count>;
@@ -1109,9 +1100,8 @@ void add_column_sums(Compute& compute, T* to, const T* from, int rows, int colum
     });
 }
 
-// Column sums that a pass over rows makes on its way: f(row, sums) adds a row's share to the sums [columns] of its
-// block of rows_a_sum rows. Returns the sums of all blocks, [blocks, columns], for add_column_sums; they last until the
-// next call.
+// f(row, sums) adds a row's share to the column sums [columns] of its block of rows_a_sum rows. Returns the sums of all
+// blocks, [blocks, columns], for add_column_sums; they last until the next call.
 constexpr int rows_a_sum = 64;
 template <class T, class F>
 const T* block_sums(Compute& compute, int rows, int columns, const F& f) {
@@ -1193,7 +1183,7 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation
     return linear(tape, x, affine, 0, affine.bias.columns, activation);
 }
 
-// to[to_rows[i]] += from[from_rows[i]] for i < count, in that order, rows of d numbers; a null list names rows 0, 1, ...
+// to[to_rows[i]] += from[from_rows[i]] for i < count, in this order, rows of d numbers; a null list: rows 0, 1, ...
 // Shared out by columns, since a row may be added to twice.
 template <class T>
 void add_rows(Compute& compute, T* to, const int* to_rows, const T* from, const int* from_rows, int count, int d) {

@@ -5,22 +5,17 @@
 //   Learning    objective, update, update_lambda                 eqs. (1) to (3) and (8) to (10)
 //   Acting      acting_batch, choose_action, rollout, evaluate   sec. III-B
 //   Phases      offline_phase, interact, online_phase            sec. III-B, IV-B.3
-//   Commands    train, eval, export, import, sweep; main
+//   Commands    one function for each, their table, main
 //
-// One code path serves three methods: DT is the likelihood alone, offline; ODT adds the entropy constraint and the
-// online phase; WODTEM adds the memory, and with alpha = 1 it is ODT bit for bit.
+// One code path serves three methods. DT has the first term of the objective alone, offline (for continuous actions the
+// squared error instead of the likelihood); ODT adds the entropy constraint and the online phase; WODTEM adds the
+// memory, and with alpha = 1 it is ODT bit for bit.
 // "Step 1" to "step 5" of sec. IV-B.3 is our numbering of what that section does in turn; the paper numbers nothing.
 // Names: theta is Agent::model, lambda Agent::temperature, Q Run::memory, D Run::replay; a_c, g_c, d_c, s_c are action,
 // return-to-go, discounted return and state of step c of a window; a-hat and w come from the memory.
-// Promises: a run is a function of its settings: the same bytes for any number of threads, in one go or continued.
+// Promises: on one machine a run is a function of its settings: the same bytes for any number of threads, in one go or
+// continued.
 // Leaves out: files, text and pictures (data/); networks in general (nn.hpp); the table itself (memory.hpp).
-
-#include <cmath>
-#include <cstdint>
-#include <functional>
-#include <span>
-#include <string>
-#include <vector>
 
 #include "gridworld.hpp"
 #include "memory.hpp"
@@ -195,6 +190,14 @@ void write_action(float* to, const EnvironmentSpec& spec, const float* action) {
     for (int i = 0; i < spec.action_dim; ++i) to[i] = spec.discrete_actions > 0 ? action[i] : clamp_action(action[i]);
 }
 
+// Writes what the memory knows a state by, both [state_dim]: the state itself, or normalised (setting keys).
+void write_memory_key(float* to, const Agent& agent, const float* state) {
+    if (agent.settings.keys == "normalized")
+        normalise(to, agent.normaliser, state);
+    else
+        std::copy_n(state, agent.spec.state_dim, to);
+}
+
 // Some windows of an update's batch: n steps, packed. c runs over the steps of a window, which are C^t of eqs. (2) and
 // (9). The paper makes of one sub-trajectory samples (s^c, g^c) of 1 to |C^t| steps. Attention is causal, so one pass
 // over the window gives pi(. | s^c, g^c) for all c at once: what stands behind step c does not enter it.
@@ -204,7 +207,7 @@ struct Batch {
     std::vector<float> actions;              // [n, action_dim] a_c
     std::vector<float> advised_actions;      // [n, action_dim] a-hat(s_c)
     std::vector<double> discounted_returns;  // [n] d_c
-    std::vector<const float*> raw_states;    // [n] s_c, in the replay buffer
+    std::vector<float> keys;                 // [n, state_dim] what the memory knows s_c by
     std::vector<double> coefficients;        // [n] 1 / (batch_size |C^t|): the mean over a window's steps, then windows
     std::vector<float> weights;              // [n] w(s_c, a_c)
     std::vector<uint32_t> random_index;      // [n] window * context_length + step: index of a step's random numbers
@@ -212,7 +215,7 @@ struct Batch {
     double short_pairs = 0;                  // steps with d_c < e-hat
 };
 
-// Step i of the batch is step t of a trajectory, whose returns, those of relabel(), do not depend on the window.
+// Writes step t of a relabelled trajectory as step i. g_t and d_t run to the trajectory's end, not the window's.
 void write_step(Batch& batch, size_t i, const Agent& agent, const Trajectory& trajectory, int t) {
     const int S = agent.spec.state_dim, A = agent.spec.action_dim;
     const float *state = &trajectory.states[t * S], *action = &trajectory.actions[t * A];
@@ -225,11 +228,10 @@ void write_step(Batch& batch, size_t i, const Agent& agent, const Trajectory& tr
     batch.sequences.timesteps[i] = t;
     write_action(&batch.actions[i * A], agent.spec, action);
     batch.discounted_returns[i] = trajectory.discounted_returns[t];
-    batch.raw_states[i] = state;
+    write_memory_key(&batch.keys[i * S], agent, state);
 }
 
-// What the network reads of these windows, and what their steps obtained; all but the batch's coefficients, weights and
-// random numbers.
+// The batch of these windows; coefficients, weights, advised_actions, random_index and neighbours stay empty.
 Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, std::span<const Window> windows) {
     Batch batch;
     size_t n = 0, i = 0;
@@ -237,7 +239,7 @@ Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, 
     batch.sequences.resize(n, agent.spec.state_dim, agent.model.config.action_dim);
     batch.actions.resize(n * agent.spec.action_dim);
     batch.discounted_returns.resize(n);
-    batch.raw_states.resize(n);
+    batch.keys.resize(n * agent.spec.state_dim);
     for (const Window& window : windows)
         for (int c = 0; c < window.length; ++c)
             write_step(batch, i++, agent, trajectories[window.trajectory], window.start + c);
@@ -249,11 +251,11 @@ Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, 
 Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
     const Agent& agent = run.agent;
     const uint32_t context_length = static_cast<uint32_t>(agent.settings.context_length);
-    const Draw draw = agent.settings.sampling == "uniform" ? Draw::uniform : Draw::by_length;
+    const Sampling sampling = agent.settings.sampling == "uniform" ? Sampling::uniform : Sampling::by_length;
     std::vector<Window> windows;
     for (uint32_t window = first; window < end; ++window)
         windows.push_back(run.replay.sample(agent.random(Stream::batch), run.progress.updates, window,
-                                            static_cast<int>(context_length), draw));
+                                            static_cast<int>(context_length), sampling));
     Batch batch = batch_of(agent, run.replay.trajectories, windows);
     for (uint32_t window = first; window < end; ++window)
         for (int c = 0, length = windows[window - first].length; c < length; ++c) {
@@ -266,26 +268,15 @@ Batch sample_batch(const Run& run, uint32_t first, uint32_t end) {
     return batch;
 }
 
-// to [state_dim] = what the memory knows s [state_dim] by: s itself, or normalised if `keys` says so.
-void write_memory_key(float* to, const Agent& agent, const float* state) {
-    if (agent.settings.keys == "normalized")
-        normalise(to, agent.normaliser, state);
-    else
-        std::copy_n(state, agent.spec.state_dim, to);
-}
-
 // WODTEM sec. IV-B.3, step 2: looks up each s_c in Q; weighs (s_c, a_c) by eq. (7) and, where it falls short, draws
 // a-hat(s_c) by eq. (6), anew in each batch. A state without a neighbour has w = 1: there is nothing to compare with.
-// Changes nothing but the batch; count_lookups() is for later.
+// Changes the batch alone; the caller hands it to count_lookups() when all parts of the update have looked up.
 void consult_memory(const Run& run, Batch& batch) {
     const Agent& agent = run.agent;
     if (!agent.uses_memory()) return;
     const Random random = agent.random(Stream::advised_action);
-    std::vector<float> keys(batch.raw_states.size() * agent.spec.state_dim);  // [n, state_dim]
-    for (size_t i = 0; i < batch.raw_states.size(); ++i)
-        write_memory_key(&keys[i * agent.spec.state_dim], agent, batch.raw_states[i]);
-    batch.neighbours = run.memory.search(keys.data(), batch.raw_states.size());
-    for (size_t i = 0; i < batch.raw_states.size(); ++i) {
+    batch.neighbours = run.memory.search(batch.keys.data(), batch.weights.size());
+    for (size_t i = 0; i < batch.weights.size(); ++i) {
         const std::span<const Neighbour> found = batch.neighbours[i];
         // Q has taken in all of D, this step too. So, unless the table has forgotten it or exclude_self is set, s_c is
         // as a rule its own first neighbour, at distance 0, and has e >= d_c there.
@@ -295,9 +286,7 @@ void consult_memory(const Run& run, Batch& batch) {
         batch.short_pairs += 1;
         const double uniform = random.uniform(run.progress.updates, batch.random_index[i]);
         const float* advised = run.memory.advised_action(found, uniform);  // eq. (6)
-        for (int j = 0; j < agent.spec.action_dim; ++j)
-            batch.advised_actions[i * agent.spec.action_dim + j] =
-                agent.discrete() ? advised[j] : clamp_action(advised[j]);
+        write_action(&batch.advised_actions[i * agent.spec.action_dim], agent.spec, advised);
     }
 }
 
@@ -378,11 +367,11 @@ Objective<T> objective(Tape<T>& tape, const Policy<T>& policy, const Batch& batc
 // sign. So lambda grows while the policy's entropy is below eta, and shrinks towards 0 while it is above. entropy:
 // H-bar of the same batch, in nats per step. ODT's code: learning rate 1e-4, no decay, no clipping, no warm-up.
 void update_lambda(Compute& compute, Temperature& temperature, const Settings& settings, double entropy) {
-    OptimizerConfig adam;
-    adam.rule = OptimizerConfig::Rule::adamw;
-    adam.learning_rate = settings.lambda_learning_rate;
-    adam.weight_decay = adam.clip_norm = 0;
-    adam.warmup_updates = 0;
+    const OptimizerConfig adam{.rule = OptimizerConfig::Rule::adamw,
+                               .learning_rate = settings.lambda_learning_rate,
+                               .weight_decay = 0,
+                               .clip_norm = 0,
+                               .warmup_updates = 0};
     temperature.log_lambda[0].gradient[0] = static_cast<float>(-temperature.lambda() * (settings.eta - entropy));
     update_parameters(compute, temperature.log_lambda, temperature.optimizer, adam);
 }
@@ -408,14 +397,6 @@ uint32_t parts_of_batch(const Settings& settings) {
     return static_cast<uint32_t>(divide_up(settings.batch_size, windows));
 }
 
-// Empties the tape. Each part of a batch draws dropout masks of its own, and each update new ones.
-void prepare_tape(Run& run, uint32_t part) {
-    run.learning.reset();
-    run.learning.part = part;
-    run.learning.dropout_random = run.agent.random(Stream::dropout);
-    run.learning.dropout_step = run.progress.updates;
-}
-
 // One update on one batch. WODTEM sec. IV-B.3, step 3: "alternately optimizing" eq. (8): a step of theta, then one of
 // lambda, with the entropy of the same pass. Errors: nn.not_finite; nn.stopped, where nothing but gradients, which are
 // no state, has changed.
@@ -428,7 +409,10 @@ void update(Run& run) {
     {
         const FrozenWeights frozen(run.compute);  // theta stands still until all parts are done
         for (uint32_t part = 0; part < parts; ++part) {
-            prepare_tape(run, part);
+            tape.reset();
+            tape.part = part;  // each part draws dropout masks of its own, and each update new ones
+            tape.dropout_random = agent.random(Stream::dropout);
+            tape.dropout_step = run.progress.updates;
             Batch& batch =
                 batches.emplace_back(sample_batch(run, windows * part / parts, windows * (part + 1) / parts));
             consult_memory(run, batch);
@@ -444,10 +428,10 @@ void update(Run& run) {
     // Before anything is changed: a run stops at its last sound state.
     if (!std::isfinite(loss + entropy))
         fail("nn.not_finite", "the loss (%g) or the entropy (%g) is not finite", loss, entropy);
-    for (const Batch& batch : batches) count_lookups(run, batch);
     // Eq. (8), theta: gradient descent (LAMB, or AdamW for DT), after which the gradients are zero again.
     const double gradient_norm =
         update_parameters(run.compute, agent.model.parameters, run.optimizer, optimizer_config(agent.settings));
+    for (const Batch& batch : batches) count_lookups(run, batch);
     // Eq. (8), lambda: gradient ascent.
     if (agent.constrains_entropy()) update_lambda(run.compute, agent.temperature, agent.settings, entropy);
     if (!std::isfinite(agent.temperature.lambda())) fail("nn.not_finite", "lambda is not finite");
@@ -462,7 +446,7 @@ void update(Run& run) {
 // Acting, sec. III-B. The agent is given a target return. In each step it sees the latest steps of its episode, each
 // with what is left of the target, and the network's last state token predicts the action.
 
-enum class Act { sample, most_likely };  // online interaction; evaluation
+enum class Act { sample, greedy };  // online interaction; evaluation
 
 // The argmax of log_p [count]; of equal ones the first.
 int most_likely_action(const float* log_p, int count) {
@@ -488,8 +472,8 @@ std::vector<float> choose_action(const Agent& agent, const Policy<float>& policy
     const int columns = policy.output.columns, first = row * columns;
     const float* output = policy.output.value + first;
     if (agent.discrete()) {
-        const int action = act == Act::most_likely ? most_likely_action(output, columns)
-                                                   : sampled_action(output, columns, random.uniform(episode, t));
+        const int action = act == Act::greedy ? most_likely_action(output, columns)
+                                              : sampled_action(output, columns, random.uniform(episode, t));
         return {static_cast<float>(action)};
     }
     // Gaussian: a = tanh(u), u = mean or mean + std * noise. Deterministic: the head's output is the action.
@@ -540,8 +524,9 @@ void append_target(Episode& episode, double target, double reward_scale) {
 }
 
 // Plays one episode in each environment, numbered from `first` on, through the network as one batch, and computes its
-// returns in hindsight. Sec. III-B: g_1 = target; a_t from the policy: sampled, or the most likely one.
-// acting: a tape that does not record, so that there is neither gradient nor dropout. Errors: nn.stopped.
+// returns in hindsight. Sec. III-B: g_1 = target; a_t from the policy: sampled, or its mean or argmax.
+// acting: a tape that does not record, so that there is neither gradient nor dropout. Errors: nn.stopped,
+// memory.not_finite, and what reset() and step() throw but environment.unstable.
 std::vector<Episode> rollout(const Agent& agent, Tape<float>& acting, std::span<Environment* const> environments,
                              Act act, double target, uint64_t first) {
     const FrozenWeights frozen(acting.compute);  // theta stands still during the rollout
@@ -584,7 +569,7 @@ Evaluation evaluate(const Agent& agent, Tape<float>& acting, std::span<Environme
                     uint64_t first) {
     Evaluation result;
     result.episodes =
-        rollout(agent, acting, environments, Act::most_likely, agent.settings.g_eval, evaluation_episodes + first);
+        rollout(agent, acting, environments, Act::greedy, agent.settings.g_eval, evaluation_episodes + first);
     // Undiscounted returns, as D4RL's scores are defined; episodes whose simulation broke down do not count.
     double length = 0, total = 0, count = 0;
     for (const Episode& episode : result.episodes) {
@@ -635,7 +620,7 @@ ProgressRow progress_row(const Run& run) {
             p.interactions,
             p.episodes,
             settings.learning_rate * warmup,
-            run.agent.temperature.lambda(),
+            run.agent.constrains_entropy() ? run.agent.temperature.lambda() : NAN,
             run.memory.size(),
             p.eval_length,
             p.eval_return,
@@ -746,7 +731,8 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
     start_offline(run, std::move(data_set));
 }
 
-// Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint.
+// Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint. After an
+// error nothing of a run that had only begun stays. Errors: checkpoint.*, run.*, file.*, those of the data set.
 bool begin_or_continue(Run& run, RunFolder& folder) try {
     const Settings& settings = run.agent.settings;
     const bool resumed = folder.has("checkpoint.safetensors");
@@ -769,7 +755,7 @@ bool begin_or_continue(Run& run, RunFolder& folder) try {
 // ---------------------------------------------------------------------------------------------------------------------
 // Training in a folder: the phases above, with the run folder and the console as their observer.
 
-// What a run does not depend on.
+// Options of train() that change no number of the run.
 struct TrainOptions {
     const Kernel& kernel;
     int threads = 1;

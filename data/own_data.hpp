@@ -40,7 +40,7 @@ HeldOut measure(const Agent& agent, Tape<float>& acting, const std::vector<Traje
         const Policy<float> policy = forward(acting, agent.model, batch.sequences, Queries::every_state);
         const Tensor<float> log_p = log_prob(acting, policy, batch.actions.data());
         for (int i = 0; i < log_p.rows; ++i) {
-            const std::vector<float> action = choose_action(agent, policy, i, Act::most_likely, Random{}, 0, 0);
+            const std::vector<float> action = choose_action(agent, policy, i, Act::greedy, Random{}, 0, 0);
             log_probs += log_p.value[i];
             errors += action_error(agent, action, &batch.actions[i * agent.spec.action_dim]);
             steps += 1;
@@ -152,7 +152,7 @@ std::vector<float> act(const Agent& agent, Tape<float>& acting, Episode& episode
     const Policy<float> policy = forward(acting, agent.model, acting_batch(agent, one), Queries::last_state);
     for (int i = 0; i < policy.output.columns; ++i)
         if (!std::isfinite(policy.output.value[i])) return {};
-    const std::vector<float> action = choose_action(agent, policy, 0, Act::most_likely, Random{}, 0, 0);
+    const std::vector<float> action = choose_action(agent, policy, 0, Act::greedy, Random{}, 0, 0);
     append_all(episode.trajectory.states, episode.state);
     append_all(episode.trajectory.actions, action);
     episode.trajectory.rewards.push_back(0);  // not known; the length counts

@@ -659,7 +659,7 @@ inline Figure policy_map(const Group& group, const Row& row) {
     for (const int cell : path) map.fill_cell(place(cell), path_colour);
     for (int cell = 0; cell < grid_goal; ++cell) {  // no move is made at the goal, which is the last cell
         const int move = most_likely(run.policy[cell]);
-        const auto& [name, word, drow, dcolumn] = grid_move_table[move];
+        const auto& [name, drow, dcolumn] = grid_move_table[move];
         map.add_arrow(place(cell), drow, dcolumn, run.policy[cell][move]);
     }
     map.add_letter(place(grid_start), "S", svg::black);

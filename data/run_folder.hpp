@@ -144,10 +144,9 @@ inline std::string progress_line(const ProgressRow& row, const Settings& setting
     const double shift = length_of_shift(t.advice_shift, spec_of(settings).discrete_actions > 0);
     std::string line =
         csv_line(row.online ? "online" : "offline", row.updates, row.interactions, row.episodes, row.learning_rate,
-                 mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0),
-                 has_entropy ? static_cast<float>(row.lambda) : NAN, mean(t.gradient_norm, t.updates),
-                 mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs), row.memory_size, row.eval_length,
-                 row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
+                 mean(t.loss, t.updates), mean(t.entropy, has_entropy ? t.updates : 0), static_cast<float>(row.lambda),
+                 mean(t.gradient_norm, t.updates), mean(t.short_pairs, t.pairs), mean(t.unmatched_pairs, t.pairs),
+                 row.memory_size, row.eval_length, row.eval_return, row.eval_score, mean(t.rollout_length, t.rollouts),
                  mean(t.rollout_return, t.rollouts), t.matched, t.evicted, t.dropped, mean(t.advice, advised_updates),
                  mean(t.advice_distance, advised_updates), mean(shift, advised_updates), physics_text(settings));
     if (settings.task != own_data) return line;

@@ -279,8 +279,10 @@ T temperature_loss(Parameter<T>& log_alpha, Tensor<T> log_prob, T target_entropy
 }
 
 // SAC algorithm 1: target = (1 - rate) target + rate value.
-EACH_TARGET inline void soft_update(std::vector<float>& target, const std::vector<float>& value, float rate) {
-    for (size_t i = 0; i < target.size(); ++i) target[i] = (1 - rate) * target[i] + rate * value[i];
+inline void soft_update(std::vector<float>& target, const std::vector<float>& value, float rate) {
+    vectorised<float>([&](auto) INLINE_LAMBDA {
+        for (size_t i = 0; i < target.size(); ++i) target[i] = (1 - rate) * target[i] + rate * value[i];
+    });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -145,10 +145,12 @@ double burn_rate(const Kernel& kernel) {
 
 std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic; }
 
-EACH_TARGET float sum_of(const float* x, size_t n) {
+float sum_of(const float* x, size_t n) {
     typedef float Lanes __attribute__((vector_size(256), aligned(4), may_alias));  // four vectors of 16 in flight
     Lanes sums = {};
-    for (size_t i = 0; i + 64 <= n; i += 64) sums += *reinterpret_cast<const Lanes*>(x + i);
+    vectorised<float>([&](auto) INLINE_LAMBDA {
+        for (size_t i = 0; i + 64 <= n; i += 64) sums += *reinterpret_cast<const Lanes*>(x + i);
+    });
     float sum = 0;
     for (int i = 0; i < 64; ++i) sum += sums[i];
     return sum;
@@ -481,7 +483,7 @@ void bench_memory(Measurements& measured, size_t entries, double bandwidth) {
         const Spread one = {spread.low / n, spread.median / n, spread.high / n};
         measured.add({group, what, one, 0, bytes, share_of(bytes / bandwidth, one)});
     };
-    constexpr double leaf = sizeof(KdTree::Lanes<float>) * (4 + 1);  // its points, and their numbers
+    constexpr double leaf = sizeof(KdTree::LeafArray<float>) * (4 + 1);  // its points, and their numbers
     add("look-up, 5000 at once", look_up, queries, leaf);
     add("insertion, 1000 in a row", arrival, arrivals);
     add("insertion and eviction, 1000 in a row", exchange, arrivals);

@@ -10,6 +10,8 @@
 // Words: in messages "file" is the number that the vector file holds, "wodtem" the one that this program computes.
 #pragma once
 
+#include "chain_statistics.hpp"
+
 namespace vectors {
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -845,7 +847,7 @@ void check_acting(Case& c) {
         for (uint32_t i = 0; i < A; ++i) noise.push_back(random.normal(number, t, i));
         uniform.push_back(random.uniform(number, t));
         const std::vector<float> action =
-            choose_action(agent, policy, 0, samples ? Act::sample : Act::most_likely, random, number, t);
+            choose_action(agent, policy, 0, samples ? Act::sample : Act::greedy, random, number, t);
         episode.step(environment, action.data(), spec.action_dim);
     }
     append_target(episode, target, settings.reward_scale);

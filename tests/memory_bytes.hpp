@@ -9,6 +9,6 @@ inline size_t memory_bytes(const EpisodicMemory& memory) {
     const auto add = [&](const auto&... columns) { ((total += columns.capacity() * sizeof(columns[0])), ...); };
     EpisodicMemory::for_each_column(memory, [&](const char*, const auto& column, size_t) { add(column); });
     const KdTree& tree = memory.tree;
-    add(memory.projection, memory.slots, tree.nodes, tree.numbers, tree.coordinates, tree.entries, tree.free_pairs);
+    add(memory.projection, memory.slots, tree.nodes, tree.split_entry, tree.coordinates, tree.entries, tree.free_pairs);
     return total + memory.heap.size() * sizeof(EpisodicMemory::HeapItem);
 }

@@ -196,7 +196,7 @@ void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
         deepest = std::max(deepest, depth);
         if (dim != KdTree::leaf) {
             Box low = box, high = box;
-            const Rank plane = {split, tree.numbers.at(node)};
+            const Rank plane = {split, tree.split_entry.at(node)};
             low.high[dim] = std::min(box.high[dim], plane);
             high.low[dim] = std::max(box.low[dim], plane);
             const size_t in_low = self(self, child, low, depth + 1), in_high = self(self, child + 1, high, depth + 1);
@@ -222,7 +222,7 @@ void check_tree(const EpisodicMemory& memory, std::vector<uint32_t> inside) {
     std::sort(inside.begin(), inside.end());
     CHECK(met == inside);
     CHECK_EQUAL(tree.nodes.size(), 2 * tree.entries.size());
-    CHECK_EQUAL(tree.numbers.size(), tree.nodes.size());
+    CHECK_EQUAL(tree.split_entry.size(), tree.nodes.size());
     CHECK_EQUAL(places.size(), tree.entries.size() - tree.free_pairs.size());
     CHECK_EQUAL(nodes.size(), 2 * places.size() - 1);
     // An inner node holds more than 8, and its lighter child about a third: no leaves of fewer than 4 on average.
@@ -375,16 +375,16 @@ TEST(replay_starts_from_low_to_high_return_and_overwrites_from_the_lowest) {
 TEST(replay_samples_every_step_alike_and_cuts_windows_at_the_end) {
     ReplayBuffer replay{.state_dim = 1, .action_dim = 1, .gamma = gamma_dr, .capacity = 4};
     const Random random{test_seed(), Stream::batch};
-    CHECK_FAILS("replay.empty", replay.sample(random, 0, 0, 5, Draw::by_length));
+    CHECK_FAILS("replay.empty", replay.sample(random, 0, 0, 5, Sampling::by_length));
     replay.start({with_return(7, 1)});
     for (uint32_t i = 0; i < 50; ++i)
-        CHECK_EQUAL(replay.sample(random, 0, i, 5, Draw::by_length).trajectory, size_t{0});
+        CHECK_EQUAL(replay.sample(random, 0, i, 5, Sampling::by_length).trajectory, size_t{0});
     replay.start({with_return(1, 1), with_return(10, 2), with_return(3, 3), with_return(40, 4)});
     replay.add(with_return(6, 0));  // overwrites the one of length 1: 59 steps
     std::map<std::pair<size_t, int>, int> hits;
     const int draws = 59000;
     for (uint32_t i = 0; i < draws; ++i) {
-        const Window window = replay.sample(random, i / 256, i % 256, 5, Draw::by_length);
+        const Window window = replay.sample(random, i / 256, i % 256, 5, Sampling::by_length);
         const int T = replay.trajectories.at(window.trajectory).length();
         CHECK(window.start >= 0 && window.start < T);
         CHECK_EQUAL(window.length, std::min(5, T - window.start));
@@ -404,7 +404,7 @@ TEST(replay_draws_trajectories_alike_where_sampling_is_uniform) {
     std::map<std::pair<size_t, int>, int> hits;
     const int draws = 40000;
     for (uint32_t i = 0; i < draws; ++i) {
-        const Window window = replay.sample(random, i / 256, i % 256, 5, Draw::uniform);
+        const Window window = replay.sample(random, i / 256, i % 256, 5, Sampling::uniform);
         const int T = replay.trajectories.at(window.trajectory).length();
         CHECK_EQUAL(window.length, std::min(5, T - window.start));
         ++hits[{window.trajectory, window.start}];
@@ -844,8 +844,8 @@ TEST(a_loaded_replay_buffer_continues_like_the_one_that_was_saved) {
     for (ReplayBuffer* replay : {&saved, &loaded}) replay->add(with_return(9, 4));
     const Random random{test_seed(), Stream::batch};
     for (uint32_t i = 0; i < 100; ++i) {
-        const Window a = saved.sample(random, 0, i, 4, Draw::uniform),
-                     b = loaded.sample(random, 0, i, 4, Draw::uniform);
+        const Window a = saved.sample(random, 0, i, 4, Sampling::uniform),
+                     b = loaded.sample(random, 0, i, 4, Sampling::uniform);
         CHECK(a.trajectory == b.trajectory && a.start == b.start && a.length == b.length);
     }
     for (size_t i = 0; i < 3; ++i) {

@@ -464,7 +464,7 @@ TEST(batches_hold_what_the_buffer_holds) {
     double sum = 0;
     size_t step = 0;
     for (uint32_t window = 0; window < 32; ++window) {
-        const Window at = f.run.replay.sample(f.run.agent.random(Stream::batch), 0, window, 4, Draw::uniform);
+        const Window at = f.run.replay.sample(f.run.agent.random(Stream::batch), 0, window, 4, Sampling::uniform);
         const Trajectory& trajectory = f.run.replay.trajectories[at.trajectory];
         CHECK_EQUAL(batch.sequences.lengths[window], std::min(4, trajectory.length() - at.start));
         for (int c = 0; c < at.length; ++c, ++step) {
@@ -515,7 +515,7 @@ TEST(advice_is_the_best_move_ever_made_in_the_cell) {
     count_lookups(f.run, batch);
     double short_pairs = 0;
     for (size_t i = 0; i < batch.weights.size(); ++i) {
-        const auto [d, a] = best.at({batch.raw_states[i][0], batch.raw_states[i][1]});
+        const auto [d, a] = best.at({batch.keys[2 * i], batch.keys[2 * i + 1]});
         const bool falls_short = batch.discounted_returns[i] < d;
         CHECK_EQUAL(batch.weights[i], falls_short ? 0.75f : 1.0f);
         if (falls_short) CHECK_EQUAL(batch.advised_actions[i], a);
@@ -715,7 +715,7 @@ TEST(exploration_draws_each_dimension_at_each_step_of_each_episode_from_the_poli
         CHECK_CLOSE(squares / 4000, 1, 0.12);
     }
     for (size_t other = 1; other < 4; ++other) CHECK_CLOSE(correlation(z[0], z[other]), 0, 0.08);
-    const std::vector<float> greedy = choose_action(run.agent, policy, 0, Act::most_likely, random, 0, 0);
+    const std::vector<float> greedy = choose_action(run.agent, policy, 0, Act::greedy, random, 0, 0);
     for (size_t i = 0; i < 2; ++i) CHECK_CLOSE(greedy[i], std::tanh(mean[i]), 1e-6);
 }
 
@@ -767,7 +767,7 @@ TEST(sampled_actions_follow_the_policy_and_evaluation_takes_the_first_of_the_mos
     for (int i = 0; i < 8; ++i) log_p[i] = static_cast<float>(std::log(p[i]));
     const Policy<float> policy = {Head::categorical, {log_p, nullptr, 1, 8}, {}};
     const Random random = {test_seed(), Stream::exploration};
-    CHECK_EQUAL(choose_action(f.run.agent, policy, 0, Act::most_likely, random, 0, 0)[0], 0.0f);
+    CHECK_EQUAL(choose_action(f.run.agent, policy, 0, Act::greedy, random, 0, 0)[0], 0.0f);
     double counts[8] = {}, chi_square = 0;
     const int n = 20000;
     for (uint32_t t = 0; t < n; ++t)
