@@ -731,9 +731,9 @@ void begin_run(Run& run, std::vector<Trajectory> data_set) {
     start_offline(run, std::move(data_set));
 }
 
-// Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint. After an
-// error nothing of a run that had only begun stays. Errors: checkpoint.*, run.*, file.*, those of the data set.
-bool begin_or_continue(Run& run, RunFolder& folder) try {
+// Continues from the folder's checkpoint, or begins anew, without logs. Returns whether there was a checkpoint. Errors:
+// checkpoint.*, run.*, file.*, those of the data set.
+bool begin_or_continue(Run& run, RunFolder& folder) {
     const Settings& settings = run.agent.settings;
     const bool resumed = folder.has("checkpoint.safetensors");
     if (resumed)
@@ -743,9 +743,6 @@ bool begin_or_continue(Run& run, RunFolder& folder) try {
     if (resumed && run.progress.online == 0)  // the checkpoint does not hold the data set
         start_offline(run, offline_set(make_data_set(settings), settings.keep_lowest));
     return resumed;
-} catch (...) {
-    forget_start(folder);
-    throw;
 }
 
 // What trains on a file alone, acts on lines of text and asks the policy for figures, by the functions above.
@@ -818,6 +815,7 @@ void train(const Settings& settings, const std::string& path, const TrainOptions
     Run run(compute, settings, *make_environment(settings));
     const bool had_log = folder.has("progress.csv"), resumed = begin_or_continue(run, folder);
     drawing_and_reading.reset();
+    describe_run(folder, settings);
     if (resumed || had_log) print_continuation(path, resumed, run.progress.updates);
     if (!resumed) folder.begin_logs(settings);
     SecondsLog seconds{folder.file("seconds.csv"), machine_text(options.kernel, options.threads)};
@@ -890,6 +888,7 @@ void command_train(const Arguments& arguments) {
 void command_eval(const Arguments& arguments) {
     Actor actor(arguments);
     const Settings& settings = actor.settings;
+    if (arguments.has("--record")) require_other_file(arguments["--record"], settings.dataset_path);
     const uint64_t first =
         arguments.has("--seed") ? 0 : first_of_last_evaluation(actor.contents, settings_in(actor.file));
     const Environments environments(*make_environment(settings), settings.eval_episodes);

@@ -225,16 +225,16 @@ inline Identity identity_of(const Settings& settings) {
 
 // The folder itself if it is a run's, else the run folders up to `levels` below it, in any order: --methods and --seeds
 // make METHOD/seed-N in --out. What is no folder has none. Errors: report.folder.
-inline std::vector<std::string> run_folders(const std::string& folder, int levels = 2) {
+inline std::vector<std::string> run_folders(const std::string& folder, int levels = 3) {
     if (is_there(folder + "/settings")) return {folder};
     std::vector<std::string> found;
     std::error_code error;
-    if (levels == 2 || (levels == 1 && !std::filesystem::is_symlink(folder, error)))  // a link may lead in a circle
+    if (levels == 3 || (levels > 0 && !std::filesystem::is_symlink(folder, error)))  // a link may lead in a circle
         for (const auto& entry : std::filesystem::directory_iterator(folder, error))
             for (const std::string& run : run_folders(entry.path(), levels - 1)) found.push_back(run);
-    if (found.empty() && levels == 2)
+    if (found.empty() && levels == 3)
         fail("report.folder",
-             "%s: is no run folder and has none one or two levels below it: nowhere there is a file `settings`, which "
+             "%s: is no run folder and has none up to three levels below it: nowhere there is a file `settings`, which "
              "training writes first",
              folder.c_str());
     return found;

@@ -374,33 +374,29 @@ inline void go_on(const RunFolder& folder, const Settings& begun, const Settings
     write_file_atomic(folder.file("settings"), settings_text(settings));
 }
 
-// A folder, which must be locked, may be new, hold this very run, perhaps with smaller budgets, or hold another run,
-// which is then left as it is. Errors: run.folder, run.other_settings, run.not_kept.
+// A folder, which must be locked, may be new, hold this very run, perhaps with smaller budgets, or hold another run or
+// files of the user's, which are then left as they are. Errors: run.folder, run.other_settings, run.not_kept, and those
+// of settings_from_text() if what is called settings is not a run's.
 inline void claim_folder(const RunFolder& folder, const Settings& settings) {
     remove_temporaries(folder.path);
-    const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors");
-    require(folder.has("settings") || !has_run, "run.folder", folder.path,
-            " holds a run without its settings file; choose another folder with --out");
+    const bool has_run = folder.has("progress.csv") || folder.has("checkpoint.safetensors") || folder.has("finished");
+    require(folder.has("settings") || !(has_run || folder.has("command")), "run.folder", folder.path,
+            " holds files of a run without its settings file; choose another folder with --out");
+    if (!folder.has("settings")) return;
     const std::string path = folder.file("settings");
-    if (folder.has("settings") && (has_run || folder.has("finished"))) {
-        const Settings begun = settings_from_text(read_file(path, 1 << 20), path);
-        const Settings larger = with_larger_budgets(begun, settings);
-        require_same_settings(larger, settings, folder.path);
-        if (larger.online_steps != begun.online_steps || larger.offline_updates != begun.offline_updates)
-            go_on(folder, begun, settings);
-    } else {
-        write_file_atomic(path, settings_text(settings));  // a start that failed may have left other settings
-    }
-    if (!folder.has("finished")) write_file_atomic(folder.file("command"), train_command(settings) + "\n");
+    const Settings begun = settings_from_text(read_file(path, 1 << 20), path);
+    if (!has_run) return;  // a run was killed before its first row, and another may begin
+    const Settings larger = with_larger_budgets(begun, settings);
+    require_same_settings(larger, settings, folder.path);
+    if (larger.online_steps != begun.online_steps || larger.offline_updates != begun.offline_updates)
+        go_on(folder, begun, settings);
 }
 
-// Of a run that failed before its first row: nothing of it stays, or the folder would pass for an unfinished run.
-inline void forget_start(const RunFolder& folder) {
-    if (folder.has("progress.csv") || folder.has("checkpoint.safetensors")) return;
-    remove_file(folder.file("settings"));
-    remove_file(folder.file("command"));
-    std::error_code not_empty;
-    std::filesystem::remove(folder.path, not_empty);
+// Writes what a run is, once its data have been read: a start that is refused leaves nothing.
+inline void describe_run(const RunFolder& folder, const Settings& settings) {
+    if (!folder.has("progress.csv") && !folder.has("checkpoint.safetensors"))
+        write_file_atomic(folder.file("settings"), settings_text(settings));
+    write_file_atomic(folder.file("command"), train_command(settings) + "\n");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -545,12 +545,12 @@ TEST(an_observation_that_would_drown_all_others_is_named) {
     rows.count = 2000, rows.state_dim = 2;
     for (size_t i = 0; i < 4000; ++i) rows.observations.push_back(static_cast<float>(i * 7 % 13));
     CHECK_EQUAL(remark_on_outliers(rows), "");
-    rows.observations[2 * 1500 + 1] = 12000;
-    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 1500, column 1 is 12000, so far from all"));
-    rows.observations[2 * 1500 + 1] = 200;
+    rows.observations[2 * 1500 + 1] = 600000;  // the others lie in a thousandth of the deviation, 13400
+    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 1500, column 1 is 600000, so far from most"));
+    rows.observations[2 * 1500 + 1] = 6000;
     CHECK_EQUAL(remark_on_outliers(rows), "");
-    rows.observations[2 * 7] = -1e38f;
-    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 7, column 0 is -1e+38, so far from all"));
+    rows.observations[2 * 7] = -1e38f, rows.observations[2 * 8] = 1e37f;  // the farthest of several is named
+    CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 7, column 0 is -1e+38, so far from most"));
     for (size_t row = 0; row < 2000; ++row) rows.observations[2 * row] = 3;  // a dead column has none
     CHECK_EQUAL(remark_on_outliers(rows), "");
 }

@@ -636,11 +636,12 @@ TEST(bars_stand_on_one_scale_and_only_where_there_are_runs) {
     CHECK_EQUAL(count(episodes, ">WODTEM<"), size_t{0});
 }
 
-TEST(a_folder_of_runs_stands_for_the_runs_one_or_two_levels_below_it) {
+TEST(a_folder_of_runs_stands_for_the_runs_up_to_three_levels_below_it) {
     const TemporaryFolder temporary;
     const std::string runs = temporary.path + "/runs", out = runs + "/report";
     const std::string a = write_run(runs, "odt", 0, {{0, 9}, {90, 5}}), b = write_run(runs, "dt", 0, {{0, 9}});
     const std::string c = write_run(runs + "/deeper", "odt", 1, {{0, 9}, {90, 5}});
+    write_run(runs + "/deeper/still/more", "odt", 2, {{0, 9}, {90, 5}});  // too deep
     write(runs, "notes", "no folder");
     for (const auto& [to, link] : {std::pair("circle", "/circle"), {".", "/here"}, {"..", "/deeper/up"}})
         std::filesystem::create_symlink(to, runs + link);
@@ -648,7 +649,7 @@ TEST(a_folder_of_runs_stands_for_the_runs_one_or_two_levels_below_it) {
     const std::string page = read_file(out + "/report.html");
     CHECK_EQUAL(report({runs}, out), text);
     CHECK(read_file(out + "/report.html") == page);
-    CHECK_EQUAL(report({temporary.path}, out).find("ODT seed 1"), std::string::npos);  // three levels below
+    CHECK(report({temporary.path}, out).find("ODT seed 1") != std::string::npos);  // three levels below
     std::filesystem::create_directories(temporary.path + "/empty/a/b");
     for (const std::string& none_there : {temporary.path + "/empty", runs + "/notes", runs + "/missing"})
         CHECK_FAILS("report.folder", report({none_there}, out));

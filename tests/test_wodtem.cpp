@@ -1392,7 +1392,7 @@ TEST(own_data_are_read_once_for_all_runs_and_what_is_changed_or_left_out_is_said
                                   scratch / "runs" + " --set offline_updates=2 --set batch_size=4");
     CHECK_EQUAL(outcome.status, 0);
     for (const char* sentence : {"1 of 60 numbers of actions lay beyond 1 and were clipped\n",
-                                 "the last 5 of 30 rows are not used: no end of a trajectory follows them\n"}) {
+                                 "of the rows, those after the last end of a trajectory are not used: 5 of 30\n"}) {
         const size_t first = outcome.text.find(sentence);
         CHECK(first != std::string::npos && outcome.text.find(sentence, first + 1) == std::string::npos);
     }
@@ -2155,7 +2155,13 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     CHECK(six.find("episode 6: ") != std::string::npos);
     settings.task = "antmaze-umaze-v2";
     CHECK_FAILS("dataset.task", quiet_train(settings, scratch / "ant"));
-    CHECK(!fs::exists(scratch / "ant"));  // or a report would take it for an unfinished run
+    CHECK(fs::is_empty(scratch / "ant"));    // or a report would take it for an unfinished run
+    fs::create_directory(scratch / "mine");  // what is there already is left as it is
+    for (const auto& [name, id] : {std::pair("command", "run.folder"), {"settings", "settings.line"}}) {
+        write_file_atomic(scratch / "mine/" + name, "mine\n");
+        CHECK_FAILS(id, quiet_train(settings, scratch / "mine"));
+        CHECK_EQUAL(read_file(scratch / "mine/" + name), "mine\n");
+    }
 
     const std::string nowhere = "D4RL_DATASET_DIR=" + (scratch / "none") + " ";
     if (!fs::exists(std::string(own_folder) + "/walker2d_medium_replay-v2.hdf5"))
