@@ -597,9 +597,17 @@ inline svg::Chart chart_of(const Group& group, const Curve& curve) {
 
 // The curves whose column `wanted` accepts.
 inline void add_curves(std::vector<Part>& parts, const Group& group, const auto& wanted) {
-    for (const Curve& curve : curves)
-        if (wanted(std::string_view(curve.y)))
-            add_chart(parts, group, chart_of(group, curve), "thin lines: each seed", curve.caption, curve.file);
+    for (const Curve& curve : curves) {
+        if (!wanted(std::string_view(curve.y))) continue;
+        add_chart(parts, group, chart_of(group, curve), "thin lines: each seed", curve.caption, curve.file);
+        const bool twice =
+            std::ranges::count(curves, curve.y, [](const Curve& c) { return std::string_view(c.y); }) > 1;
+        if (twice || group.any().own()) continue;
+        Curve again = curve;
+        again.x = "interactions";
+        add_chart(parts, group, chart_of(group, again), "thin lines: each seed", "The same over interactions.",
+                  std::string(curve.file) + "-interactions");
+    }
 }
 
 // Bars of a row's runs; heights(run): of each category, or none.
