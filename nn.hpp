@@ -291,6 +291,7 @@ class Threads {
     std::atomic<uint64_t> jobs_{0};   // begun so far, the order to stop among them
 };
 
+// n / by, rounded up; n >= 0, by > 0.
 template <class N>
 N divide_up(N n, std::type_identity_t<N> by) {
     return (n + by - 1) / by;

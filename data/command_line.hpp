@@ -416,7 +416,12 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
 // The settings of a model with what `eval` was told to change. Errors: usage.*.
 inline Settings evaluated_settings(const Arguments& arguments, const TensorFile& file) {
     Settings settings = settings_in(file);
-    if (arguments.has("--record")) require_other_file(arguments["--record"], file.path);
+    if (arguments.has("--record")) {  // now, not after an evaluation
+        require_other_file(arguments["--record"], file.path);
+        std::error_code none;
+        require(std::filesystem::is_directory(std::filesystem::absolute(arguments["--record"]).parent_path(), none),
+                "file.write", arguments["--record"], ": its folder does not exist; make it first");
+    }
     if (find_mujoco_task(settings.task))
         settings.mujoco = mujoco_version();  // of the library that steps the bodies here
     if (arguments.has("--episodes"))

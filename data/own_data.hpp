@@ -63,8 +63,10 @@ void print_held_out(const Run& run, const std::string& path, const HeldOut& held
     if (trajectories == 0)
         return void(std::printf("%s: %s updates; no trajectory is held out, so nothing is measured\n", path.c_str(),
                                 updates.c_str()));
-    std::printf("%s: %s updates; trajectories held out: %zu; log-probability of an action %s, %s %s\n", path.c_str(),
-                updates.c_str(), trajectories, number_text(static_cast<float>(held_out.log_prob)).c_str(),
+    const bool likelihood = run.agent.model.config.head != Head::deterministic;
+    std::printf("%s: %s updates; trajectories held out: %zu; %s %s, %s %s\n", path.c_str(), updates.c_str(),
+                trajectories, likelihood ? "log-probability of an action" : "minus the loss",
+                number_text(static_cast<float>(held_out.log_prob)).c_str(),
                 run.agent.discrete() ? "share of other moves" : "squared error of the mean",
                 number_text(static_cast<float>(held_out.error)).c_str());
 }

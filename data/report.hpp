@@ -923,11 +923,16 @@ inline std::string updates_sentence(const Group& group) {
                              "updates with those over interactions.";
 }
 
+// Own data of moves and of continuous actions are measured otherwise, also if their files have one name.
+inline std::string section_name(const Run& run) {
+    return data_name(run.settings) + (run.own() && run.settings.moves > 0 ? "-moves" : "");
+}
+
 // The section of runs of one task, preset and physics, sorted as Group says. Errors: report.same_seed.
 inline Section make_section(const Runs& runs, const std::string& out_folder) {
     const Settings& settings = runs.at(0)->settings;
     const bool mujoco = runs[0]->mujoco != nullptr, own = runs[0]->own();
-    const std::string name = data_name(settings);
+    const std::string name = section_name(*runs[0]);
     Group group{runs,
                 name,
                 "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
@@ -971,8 +976,7 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs, const std::string& out_folder) {
     std::map<std::array<std::string, 3>, Runs> groups;
-    for (const Run& run : runs)
-        groups[{data_name(run.settings), run.settings.preset, run.settings.physics}].push_back(&run);
+    for (const Run& run : runs) groups[{section_name(run), run.settings.preset, run.settings.physics}].push_back(&run);
     const char* const numbers =
         "One section for each task, preset and physics. Runs with equal settings but for the seed are averaged; "
         "others stand apart, and a label in parentheses names the settings that differ from the preset and from other "
@@ -1001,7 +1005,13 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
     std::vector<Run> runs;
     for (const std::string& folder : folders)
-        for (const std::string& one : run_folders(folder)) runs.push_back(read_run(one));
+        for (const std::string& one : run_folders(folder)) try {
+                runs.push_back(read_run(one));
+            } catch (const Error& error) {
+                if (one == folder) throw;  // it was asked for by name
+                std::fprintf(stderr, "left out of the report: %s\n", error.what());
+            }
+    if (runs.empty()) fail("report.nothing", "report: none of the runs found can be read; nothing was written");
     const auto order = [](const Run& run) { return std::tie(run.method, run.identity, run.settings.seed); };
     std::ranges::stable_sort(runs, {}, order);
     const std::vector<Section> sections = make_sections(runs, out_folder);

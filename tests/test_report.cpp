@@ -655,6 +655,11 @@ TEST(a_folder_of_runs_stands_for_the_runs_up_to_three_levels_below_it) {
     for (const std::string& none_there : {temporary.path + "/empty", runs + "/notes", runs + "/missing"})
         CHECK_FAILS("report.folder", report({none_there}, out));
     CHECK_FAILS("report.same_seed", report({runs, a}, out));
+    write(c, "progress.csv", "no columns\n");  // below a folder it is left out with a sentence, by name an error
+    CHECK_EQUAL(report({temporary.path}, out).find("ODT seed 1"), std::string::npos);
+    CHECK_FAILS("csv.column", report({c}, out));
+    write(write_run(temporary.path + "/empty", "odt", 3, {{0, 9}}), "progress.csv", "no columns\n");
+    CHECK_FAILS("report.nothing", report({temporary.path + "/empty"}, out));
 }
 
 TEST(pages_link_the_files_of_a_run_and_say_when_and_where_it_was_made) {
@@ -742,6 +747,9 @@ TEST(own_data_are_compared_by_their_action_error_and_named_where_they_differ) {
     // DT of moves is trained by their likelihood.
     text = narrow(report({run("dt", "aaaaaaaaaa", 4, "-0.5", "0.25")}, out));
     CHECK_CONTAINS(text, "| DT | 1 | 0.2500 ± - | 0.5750 ± - | −0.50 ± - |");
+    text = report({odt, run("dt", "cccccccccc", 4, "-0.5", "0.25")}, out);  // another measure: a section of its own
+    CHECK(text.find("data-own, preset small") < text.find("data-own-moves, preset small"));
+    CHECK(text.find("data-own-moves, preset small") != std::string::npos);
     text = narrow(report({odt, run("odt", "bbbbbbbbbb", 0, "-7", "0.5")}, out));
     CHECK_CONTAINS(text, "| ODT (dataset=own.hdf5 (SHA-256 aaaaaaaa)) | 1 | 0.1250 ± - |");
     CHECK_CONTAINS(text, "| ODT (dataset=own.hdf5 (SHA-256 bbbbbbbb)) | 1 | 0.5000 ± - |");
