@@ -1362,14 +1362,14 @@ TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
     check_shell(command.substr(0, command.size() - 1) + " --out " + scratch / "again", 0, "trajectories held out");
     CHECK(read_file(scratch / "whole/model.safetensors") == read_file(scratch / "again/model.safetensors"));
     check_shell("./wodtem report " + scratch / "whole --out " + scratch / "report", 0, "log-probability, held out");
-    CHECK(fs::exists(scratch / "report/data-own-small-held-out.svg"));
+    CHECK(fs::exists(scratch / "report/data-own-moves-small-held-out.svg"));
     check_shell("./wodtem eval " + scratch / "whole", 1, "own data have no environment");
     fs::rename(settings.dataset_path, scratch / "gridworld.hdf5");  // beside the grid world, whose name it has
     quiet_train(tiny_settings("wodtem"), scratch / "grid");
     check_shell("./wodtem train " + scratch / "gridworld.hdf5 --set offline_updates=5 --out " + scratch / "named", 0,
                 "5 upd");
     check_shell("./wodtem report " + scratch / "named " + scratch / "grid --out " + scratch / "both", 0,
-                "data-gridworld, preset");
+                "data-gridworld-moves, preset");
     CHECK(read_file(scratch / "both/report.md").find(" gridworld, preset") != std::string::npos);
     fs::rename(scratch / "gridworld.hdf5", settings.dataset_path);
     check_shell("./wodtem train data", 2, "wodtem train FILE.hdf5");
