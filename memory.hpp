@@ -81,8 +81,7 @@ inline void relabel(Trajectory& trajectory, int state_dim, int action_dim, doubl
     trajectory.discounted_returns = discounted_returns(trajectory.rewards, gamma);
 }
 
-// WODTEM sec. III-A: the total return is g_1.
-// g_0, the undiscounted return. Errors: memory.not_relabelled.
+// WODTEM sec. III-A: the total return is g_1. Errors: memory.not_relabelled.
 inline double total_return(const Trajectory& trajectory) {
     if (trajectory.returns_to_go.empty()) fail("memory.not_relabelled", "a trajectory has no returns: relabel it");
     return trajectory.returns_to_go.front();

@@ -888,7 +888,6 @@ void command_train(const Arguments& arguments) {
 void command_eval(const Arguments& arguments) {
     Actor actor(arguments);
     const Settings& settings = actor.settings;
-    if (arguments.has("--record")) require_other_file(arguments["--record"], settings.dataset_path);
     const uint64_t first =
         arguments.has("--seed") ? 0 : first_of_last_evaluation(actor.contents, settings_in(actor.file));
     const Environments environments(*make_environment(settings), settings.eval_episodes);

@@ -300,8 +300,8 @@ inline void take_file(Settings& settings, const std::string& path, const Setting
 inline void find_data_again(Settings& settings, const std::string& path, const std::string& whose) {
     settings.dataset_path = path;
     if (sha256_of_file(path) != settings.dataset_sha256)
-        fail("dataset.other", "%s is not the data set of %s, whose SHA-256 is %s; give it by --dataset", path.c_str(),
-             whose.c_str(), settings.dataset_sha256.c_str());
+        fail("dataset.other", "%s is not the data set of %s: its SHA-256 is not %s", path.c_str(), whose.c_str(),
+             settings.dataset_sha256.c_str());
 }
 
 // given: a file; "random": none, so ten episodes of random actions and the online phase alone; "": the file of the
@@ -413,15 +413,22 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
     return settings;
 }
 
+// Sees, before an evaluation, whether a file can be written there that replaces neither the model nor the data set of
+// its run. Errors: file.input, file.write, those of written_path().
+inline void require_place_of_record(const std::string& record, const std::string& model, const Settings& settings) {
+    require_other_file(record, model);
+    std::error_code none;
+    require(std::filesystem::is_directory(std::filesystem::absolute(record).parent_path(), none), "file.write", record,
+            ": its folder does not exist; make it first");
+    if (settings.dataset_sha256 != "none" && is_there(record))
+        require(sha256_of_file(record) != settings.dataset_sha256, "file.input", record, ": is the data set that ",
+                model, " learned from; give another path to write to");
+}
+
 // The settings of a model with what `eval` was told to change. Errors: usage.*.
 inline Settings evaluated_settings(const Arguments& arguments, const TensorFile& file) {
     Settings settings = settings_in(file);
-    if (arguments.has("--record")) {  // now, not after an evaluation
-        require_other_file(arguments["--record"], file.path);
-        std::error_code none;
-        require(std::filesystem::is_directory(std::filesystem::absolute(arguments["--record"]).parent_path(), none),
-                "file.write", arguments["--record"], ": its folder does not exist; make it first");
-    }
+    if (arguments.has("--record")) require_place_of_record(arguments["--record"], file.path, settings);
     if (find_mujoco_task(settings.task))
         settings.mujoco = mujoco_version();  // of the library that steps the bodies here
     if (arguments.has("--episodes"))

@@ -1005,12 +1005,14 @@ inline std::string report(const std::vector<std::string>& folders, const std::st
     if (folders.empty()) fail("report.nothing", "report: no run folder was given; give at least one");
     std::vector<Run> runs;
     for (const std::string& folder : folders)
-        for (const std::string& one : run_folders(folder)) try {
+        for (const std::string& one : run_folders(folder)) {
+            try {
                 runs.push_back(read_run(one));
             } catch (const Error& error) {
                 if (one == folder) throw;  // it was asked for by name
                 std::fprintf(stderr, "left out of the report: %s\n", error.what());
             }
+        }
     if (runs.empty()) fail("report.nothing", "report: none of the runs found can be read; nothing was written");
     const auto order = [](const Run& run) { return std::tie(run.method, run.identity, run.settings.seed); };
     std::ranges::stable_sort(runs, {}, order);

@@ -2149,6 +2149,10 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     check_shell("./wodtem eval " + (scratch / "renamed") + " --record " + (scratch / "made.hdf5"), 0,
                 "mean length " + last[12] + ", mean return " + last[13] + " +-");
     check_shell("./wodtem info " + (scratch / "made.hdf5") + " --task maze2d-umaze", 0, "trajectories: 3");
+    const std::string bytes = read_file(data), record = "./wodtem eval " + (scratch / "renamed") + " --record ";
+    check_shell(record + data, 1, data + ": is the data set that ");
+    CHECK(read_file(data) == bytes);
+    check_shell(record + (scratch / "no/made.hdf5"), 1, "no/made.hdf5: its folder does not exist");
     // More episodes begin with the same ones.
     const std::string six = shell("./wodtem eval " + (scratch / "renamed") + " --episodes 6 2>/dev/null").text;
     CHECK(six.starts_with(shell("./wodtem eval " + (scratch / "renamed") + " | grep ^episode").text));
