@@ -75,26 +75,14 @@ inline void print_data_set(const std::string& path, std::string id) {
 // Safetensors.
 
 // Least, greatest and mean of the finite numbers, and the count of the others.
-template <class T>
-std::string value_range(std::vector<T> values) {
-    const size_t others = std::erase_if(values, [](T x) { return !std::isfinite(static_cast<double>(x)); });
+inline std::string value_range(std::vector<double> values) {
+    const size_t others = std::erase_if(values, [](double x) { return !std::isfinite(x); });
     if (values.empty()) return "nothing finite";
     Moments finite;
-    for (const T value : values) finite.add(static_cast<double>(value));
+    for (const double value : values) finite.add(value);
     char text[160];
     std::snprintf(text, sizeof text, "%.6g to %.6g, mean %.6g", finite.low, finite.high, finite.mean());
     return text + (others > 0 ? ", NOT FINITE: " + std::to_string(others) : std::string());
-}
-
-// Of a tensor whose type is one of Types, or has 16 bits; "" for any other.
-template <class... Types>
-std::string range_of(const TensorFile& file, const StoredTensor& tensor) {
-    std::string range;
-    if (tensor.dtype == DType::F16 || tensor.dtype == DType::BF16) range = value_range(file.numbers(tensor));
-    ((dtype_of<Types>() == tensor.dtype ? void(range = value_range(file.get<Types>(tensor.name, tensor.shape)))
-                                        : void()),
-     ...);
-    return range;
 }
 
 inline void print_tensors(const std::string& path) {
@@ -109,8 +97,7 @@ inline void print_tensors(const std::string& path) {
     }
     for (const StoredTensor& tensor : file.tensors)
         std::printf("%-44s %s %-14s %s\n", tensor.name.c_str(), about(tensor.dtype).name,
-                    shape_text(tensor.shape).c_str(),
-                    range_of<float, double, uint8_t, uint32_t, uint64_t, int64_t>(file, tensor).c_str());
+                    shape_text(tensor.shape).c_str(), value_range(file.numbers(tensor)).c_str());
 }
 
 // The command `info`. task: a task's id, or "".

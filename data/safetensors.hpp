@@ -301,6 +301,9 @@ inline float half_value(uint16_t bits) {
     return bits >> 15 != 0 ? -magnitude : magnitude;
 }
 
+// The same for bfloat16: the upper half of a float.
+inline float bf16_value(uint16_t bits) { return std::bit_cast<float>(uint32_t{bits} << 16); }
+
 enum class DType : uint8_t { F32, F64, F16, BF16, U8, U32, U64, I32, I64, BOOL };
 struct DTypeInfo {
     const char* name;
@@ -426,23 +429,29 @@ struct TensorFile {
         return out;
     }
 
-    // Returns the numbers of a tensor of any kind of float, exactly; of another tensor none.
-    std::vector<double> numbers(const StoredTensor& tensor) const {
+    // Returns a tensor's numbers, whatever their type in the file. A double holds all but large whole numbers exactly, a
+    // long double every one.
+    template <class Number = double>
+    std::vector<Number> numbers(const StoredTensor& tensor) const {
         const std::string_view from = bytes(tensor);
-        const size_t width = about(tensor.dtype).size;
         const auto all = [&](auto stored, const auto& value) {
-            std::vector<double> out;
-            for (size_t at = 0; at < from.size(); at += width) {
-                std::memcpy(&stored, &from[at], width);
-                out.push_back(value(stored));
+            std::vector<Number> out;
+            for (size_t at = 0; at < from.size(); at += sizeof stored) {
+                std::memcpy(&stored, &from[at], sizeof stored);
+                out.push_back(static_cast<Number>(value(stored)));
             }
             return out;
         };
-        if (tensor.dtype == DType::F32) return all(0.0f, [](float x) { return x; });
-        if (tensor.dtype == DType::F64) return all(0.0, [](double x) { return x; });
+        constexpr std::identity same;
+        if (tensor.dtype == DType::F32) return all(0.0f, same);
+        if (tensor.dtype == DType::F64) return all(0.0, same);
         if (tensor.dtype == DType::F16) return all(uint16_t{0}, half_value);
-        if (tensor.dtype != DType::BF16) return {};
-        return all(uint16_t{0}, [](uint16_t bits) { return std::bit_cast<float>(uint32_t{bits} << 16); });
+        if (tensor.dtype == DType::BF16) return all(uint16_t{0}, bf16_value);
+        if (tensor.dtype == DType::U32) return all(uint32_t{0}, same);
+        if (tensor.dtype == DType::U64) return all(uint64_t{0}, same);
+        if (tensor.dtype == DType::I32) return all(int32_t{0}, same);
+        if (tensor.dtype == DType::I64) return all(int64_t{0}, same);
+        return all(uint8_t{0}, same);  // U8, BOOL
     }
 
     // Returns a tensor of any kind of float, each number rounded to the nearest float. Errors: those of read_into() but

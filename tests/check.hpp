@@ -62,35 +62,6 @@ struct Array {
     int back() const { return static_cast<int>(shape.back()); }
 };
 
-// The entries of a tensor as long doubles, which hold every number of every type exactly.
-std::vector<long double> entries(const TensorFile& file, const StoredTensor& tensor) {
-    if (const std::vector<double> floats = file.numbers(tensor); !floats.empty()) return {floats.begin(), floats.end()};
-    std::vector<long double> values(tensor.size / about(tensor.dtype).size);
-    const auto read = [&](auto x) {
-        for (size_t i = 0; i < values.size(); ++i) {
-            std::memcpy(&x, file.bytes(tensor).data() + i * sizeof x, sizeof x);
-            values[i] = static_cast<long double>(x);
-        }
-    };
-    switch (tensor.dtype) {
-        case DType::U32:
-            read(uint32_t{});
-            break;
-        case DType::U64:
-            read(uint64_t{});
-            break;
-        case DType::I32:
-            read(int32_t{});
-            break;
-        case DType::I64:
-            read(int64_t{});
-            break;
-        default:
-            read(uint8_t{});  // U8, BOOL
-    }
-    return values;
-}
-
 std::string shown(long double x) {
     if (std::isnan(x)) return "nan";  // of either sign
     char text[48];
@@ -172,7 +143,7 @@ struct Case {
         const StoredTensor& tensor = need("in/" + tensor_name);
         check_shape(tensor, pattern);
         Array<T> array = {tensor.shape, {}};
-        for (const long double x : entries(file, tensor)) {
+        for (const long double x : file.numbers<long double>(tensor)) {
             const T value = array.values.emplace_back(static_cast<T>(x));
             rounded |= std::is_same_v<T, float> && static_cast<long double>(value) != x && !std::isnan(x);
         }
@@ -182,7 +153,7 @@ struct Case {
     [[noreturn]] void refuse_entry(const std::string& tensor_name, size_t at, const std::string& expected) {
         const StoredTensor& tensor = need("in/" + tensor_name);
         fail("check.value", "%s: entry %s is %s, expected %s", where(tensor).c_str(), place(tensor.shape, at).c_str(),
-             shown(entries(file, tensor)[at]).c_str(), expected.c_str());
+             shown(file.numbers<long double>(tensor)[at]).c_str(), expected.c_str());
     }
 
     template <class T>
@@ -298,7 +269,7 @@ struct Case {
         check_shape(tensor, shape);
         const Tolerance allowed = tolerance(output);
         const bool exact = allowed.exact || std::is_integral_v<T>;
-        std::vector<long double> stored = entries(file, tensor);
+        std::vector<long double> stored = file.numbers<long double>(tensor);
         stored.resize(wodtem.size());
         long double scale = 0;
         for (const long double x : stored)
@@ -1814,7 +1785,7 @@ std::string first_not_finite(const Case& c) {
     for (const std::string& name : c.named("in/")) {
         if (name == "memory/distance") continue;  // infinite where there is no neighbour
         const StoredTensor& tensor = c.file.find(c.name + "/in/" + name);
-        const std::vector<long double> values = entries(c.file, tensor);
+        const std::vector<long double> values = c.file.numbers<long double>(tensor);
         const auto bad = std::find_if_not(values.begin(), values.end(), [](long double x) { return std::isfinite(x); });
         if (!text.empty() || bad == values.end()) continue;
         text = c.where(tensor) + ": entry " + place(tensor.shape, static_cast<size_t>(bad - values.begin())) + " is " +
@@ -1833,7 +1804,7 @@ void print_inputs(const Case& c) {
             std::printf("    %s = %s\n", printable(key.substr(c.name.size() + 1)).c_str(), printable(text).c_str());
     for (const StoredTensor& tensor : c.file.tensors)
         if (tensor.name.starts_with(c.name + "/in/"))
-            Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, entries(c.file, tensor));
+            Case::print(tensor.name.substr(c.name.size() + 1), tensor.shape, c.file.numbers<long double>(tensor));
 }
 
 // Computes a case with each function of its topic. Errors: check.unknown for what none of them reads.
