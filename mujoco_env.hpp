@@ -72,6 +72,26 @@ inline std::vector<MazeCell> cells_marked(std::string_view map, char mark) {
     return cells;
 }
 
+// A map as a grid of cells, which are its characters.
+struct MazeGrid {
+    std::string_view map;
+    int columns = static_cast<int>(map.find('/')), rows = static_cast<int>(map.size()) / (columns + 1);
+
+    // Whether a place is on the map; NaN is not.
+    bool contains(double row, double column) const { return row >= 0 && row < rows && column >= 0 && column < columns; }
+    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
+    bool can_enter(MazeCell to) const {
+        return contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
+    }
+    // The cells with one of the marks, mark by mark.
+    std::vector<MazeCell> cells(std::string_view marks) const {
+        std::vector<MazeCell> all;
+        for (const char mark : marks)
+            for (const MazeCell cell : cells_marked(map, mark)) all.push_back(cell);
+        return all;
+    }
+};
+
 // ---------------------------------------------------------------------------------------------------------------------
 // The table of tasks.
 
@@ -314,8 +334,7 @@ struct MujocoEnvironment : Environment {
         const double noise = task->reset_noise;
         std::vector<double> qpos(model->qpos0, model->qpos0 + model->nq), qvel(model->nv);
         if (task->rules == Rules::maze2d) {  // D4RL: a free cell, the goal's among them
-            std::vector<MazeCell> cells = cells_marked(task->maze, '0');
-            cells.push_back(cells_marked(task->maze, 'G')[0]);
+            const std::vector<MazeCell> cells = MazeGrid{task->maze}.cells("0G");
             const MazeCell cell = cells[random.below(cells.size(), episode, draws++)];
             qpos = {static_cast<double>(cell.row), static_cast<double>(cell.column)};
         }

@@ -313,9 +313,8 @@ inline std::vector<double> read_side_by_side(const Hdf5File& file, const std::st
 // columns and up the rows from the middle of the map, maze2d's x and y down rows and along columns (maze_place()).
 //   states, rows (X, Y, VX, VY):   (rows / 2 - 0.7 - Y, columns / 2 - 0.7 + X, -VY, VX)     actions (A, B):   (-B, A)
 inline void turn_to_maze2d(std::vector<double>& states, std::vector<float>& actions, const MujocoTask& task) {
-    const std::string_view map = task.maze;
-    const double top = static_cast<double>(std::ranges::count(map, '/')) / 2 - 0.7;
-    const double left = static_cast<double>(map.find('/')) / 2 - 0.7;
+    const MazeGrid grid{task.maze};
+    const double top = grid.rows / 2.0 - 0.7, left = grid.columns / 2.0 - 0.7;
     for (size_t i = 0; i + 4 <= states.size(); i += 4) {
         const std::array<double, 4> s = {states[i], states[i + 1], states[i + 2], states[i + 3]};
         std::ranges::copy(std::array{top - s[1], left + s[0], -s[3], s[2]}, &states[i]);
@@ -494,16 +493,12 @@ inline void require_sound(const Rows& rows, const std::string& path, float large
 inline std::vector<size_t> rows_outside(const Rows& rows, const MujocoTask& task) {
     std::vector<size_t> outside;
     if (task.rules != Rules::maze2d) return outside;
-    const std::string_view map = task.maze;
-    const size_t width = map.find('/') + 1;
+    const MazeGrid grid{task.maze};
     for (size_t row = 0; row < rows.count; ++row) {
         const float* const state = rows.observation(row);
         const MazePlace place = maze_place(task, state[0], state[1]);
-        const bool near = std::fabs(place.row) < 100 && std::fabs(place.column) < 100;  // never so for NaN
-        const long i = near ? std::lround(place.row) : -1, j = near ? std::lround(place.column) : -1;
-        const size_t cell = static_cast<size_t>(i) * width + static_cast<size_t>(j);
-        const bool on_map = i >= 0 && j >= 0 && static_cast<size_t>(j) + 1 < width && cell < map.size();
-        if (!on_map || map[cell] == '1') outside.push_back(row);
+        const double i = std::round(place.row), j = std::round(place.column);
+        if (!grid.contains(i, j) || !grid.can_enter({static_cast<int>(i), static_cast<int>(j)})) outside.push_back(row);
     }
     return outside;
 }

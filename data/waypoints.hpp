@@ -11,25 +11,7 @@
 #include "rows.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The planner. Cells are the characters of the map. In maze2d row is x and column is y, in antmaze the other way round.
-
-struct MazeGrid {
-    std::string_view map;
-    int columns = static_cast<int>(map.find('/')), rows = static_cast<int>(map.size()) / (columns + 1);
-
-    // Whether a place is on the map; NaN is not.
-    bool contains(double row, double column) const { return row >= 0 && row < rows && column >= 0 && column < columns; }
-    size_t number(MazeCell cell) const { return cell.row * columns + cell.column; }
-    bool can_enter(MazeCell to) const {
-        return contains(to.row, to.column) && map[to.row * (columns + 1) + to.column] != '1';
-    }
-    // The cells with one of the marks, mark by mark.
-    std::vector<MazeCell> cells(std::string_view marks) const {
-        std::vector<MazeCell> all;
-        for (const char mark : marks) append_all(all, cells_marked(map, mark));
-        return all;
-    }
-};
+// The planner. In maze2d a cell's row is x and its column is y, in antmaze the other way round.
 
 // The shortest ways to a target, breadth first. They lead through no wall, but may start in one: the ball comes as near
 // as 0.4 to a wall's centre, so its rounded position can be one, and the ant's torso may be over a wall's corner.
