@@ -44,11 +44,9 @@ Tolerance parse_tolerance(const std::string& text, const std::string& where) {
         *word->second = *x;
         words.erase(word);
     }
-    if (!good)
-        fail("check.tolerance",
-             "%s is %s, expected \"exact: REASON\", or any of these with a colon after the last: \"float64 1e-12, "
-             "float32 1e-6, absolute 0: REASON\"",
-             where.c_str(), json_string(text.substr(0, 80)).c_str());
+    require(good, "check.tolerance", where, " is ", json_string(text.substr(0, 80)),
+            ", expected \"exact: REASON\", or any of these with a colon after the last: \"float64 1e-12, float32 1e-6, "
+            "absolute 0: REASON\"");
     return tolerance;
 }
 
@@ -115,10 +113,13 @@ struct Case {
 
     const StoredTensor& need(const std::string& tensor) {
         const StoredTensor* found = find(tensor);
-        if (!found)
-            fail("check.missing", "%s: case %s has no tensor %s; tests/vectors/README.md lists what its topic needs",
-                 file.path.c_str(), json_string(name).c_str(), json_string(name + "/" + tensor).c_str());
+        require(found, "check.missing", file.path, ": case ", json_string(name), " has no tensor ",
+                json_string(name + "/" + tensor), "; tests/vectors/README.md lists what its topic needs");
         return *found;
+    }
+    // Errors: check.value, unless the condition holds.
+    void require_value(bool holds, const auto&... parts) const {
+        require(holds, "check.value", file.path, ": case ", name, ": ", parts...);
     }
 
     void check_shape(const StoredTensor& tensor, const Shape& pattern) const {
@@ -206,9 +207,8 @@ struct Case {
             x = in<double>(setting, {}).values[0];
         } else if (text != file.metadata.end()) {
             const std::optional<double> parsed = text->second == "inf" ? INFINITY : to_number(text->second);
-            if (!parsed)
-                fail("check.value", "%s is %s, expected a number", place.c_str(),
-                     json_string(text->second.substr(0, 80)).c_str());
+            require(parsed.has_value(), "check.value", place, " is ", json_string(text->second.substr(0, 80)),
+                    ", expected a number");
             x = *parsed;
         } else if (fallback) {
             x = *fallback;
@@ -217,16 +217,15 @@ struct Case {
                  file.path.c_str(), json_string(name).c_str(), json_string(key).c_str(),
                  json_string(name + "/in/" + setting).c_str());
         }
-        if (!(x >= low && x <= high))
-            fail("check.value", "%s is %.17g, expected a number from %g to %g", place.c_str(), x, low, high);
+        require(x >= low && x <= high, "check.value", place, " is ", number_text(x), ", expected a number from ", low,
+                " to ", high);
         return x;
     }
-    int64_t whole(const std::string& setting, std::optional<double> fallback, double low, double high) {
+    template <class T = int64_t>
+    T whole(const std::string& setting, std::optional<double> fallback, double low, double high) {
         const double x = number(setting, fallback, low, high);
-        if (x != std::floor(x))
-            fail("check.value", "%s: case %s: %s is %.17g, expected a whole number", file.path.c_str(), name.c_str(),
-                 setting.c_str(), x);
-        return static_cast<int64_t>(x);
+        require_value(x == std::floor(x), setting, " is ", number_text(x), ", expected a whole number");
+        return static_cast<T>(x);
     }
     // A word of `choices`, which are separated by |; the first is the fallback. Metadata entry CASE.NAME.
     std::string word(const std::string& setting, const std::string& choices) {
@@ -235,9 +234,8 @@ struct Case {
         const auto text = file.metadata.find(key);
         const std::vector<std::string> words = split(choices, '|');
         if (text == file.metadata.end()) return words[0];
-        if (std::find(words.begin(), words.end(), text->second) == words.end())
-            fail("check.value", "%s: metadata entry %s is %s, expected one of %s", file.path.c_str(),
-                 json_string(key).c_str(), json_string(text->second.substr(0, 80)).c_str(), choices.c_str());
+        require(contains(words, text->second), "check.value", file.path, ": metadata entry ", json_string(key), " is ",
+                json_string(text->second.substr(0, 80)), ", expected one of ", choices);
         return text->second;
     }
 
@@ -348,9 +346,8 @@ struct Graph {
         variables.push_back(std::make_unique<Variable>(Variable{name, c.in<T>(name, pattern), {}, {}}));
         Variable& v = *variables.back();
         v.gradient.resize(v.array.values.size());
-        if (v.array.back() < 1 || v.array.values.size() >= 1u << 31)
-            fail("check.shape", "%s: has shape %s, expected at least one column and less than 2^31 numbers",
-                 c.where(c.need("in/" + name)).c_str(), shape_text(v.array.shape).c_str());
+        require(v.array.back() >= 1 && v.array.values.size() < 1u << 31, "check.shape", c.where(c.need("in/" + name)),
+                ": has shape ", shape_text(v.array.shape), ", expected at least one column and less than 2^31 numbers");
         const bool row = v.array.shape.size() == 1;
         v.place.data = v.gradient.data();
         return {v.array.values.data(), &v.place, row ? 1 : v.array.extent(0), v.array.back()};
@@ -383,8 +380,7 @@ struct Graph {
     }
 };
 
-Shape shape_of(int rows, int columns) { return {static_cast<uint64_t>(rows), static_cast<uint64_t>(columns)}; }
-Shape shape_of(int n) { return {static_cast<uint64_t>(n)}; }
+Shape shape_of(auto... extents) { return {static_cast<uint64_t>(extents)...}; }
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Topics: random numbers and returns
@@ -403,17 +399,16 @@ void check_rng(Case& c) {
         return c.expect("words", {counter.shape[0], 4}, words);
     }
     // What is drawn from it by (seed, stream, step, site, index).
-    const Random random{static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF)),
-                        static_cast<uint32_t>(c.whole("stream", {}, 0, 0xFFFFFFFF))};
+    const Random random{c.whole<uint32_t>("seed", {}, 0, 0xFFFFFFFF), c.whole<uint32_t>("stream", {}, 0, 0xFFFFFFFF)};
     if (c.has("out/dropout")) {
         const uint64_t n = c.array_size("out/dropout");
-        const Dropout dropout{random, static_cast<uint64_t>(c.whole("update", 0, 0, 0x1p53)),
-                              static_cast<uint32_t>(c.whole("place", 0, 0, 0xFFFFFFFF)),
+        const Dropout dropout{random, c.whole<uint64_t>("update", 0, 0, 0x1p53),
+                              c.whole<uint32_t>("place", 0, 0, 0xFFFFFFFF),
                               static_cast<float>(c.number("probability", {}, 0, 0.99))};
         Tape<float> tape(c.compute);
-        const DropoutMask<float> mask = dropout_mask(tape, dropout, 1, static_cast<ptrdiff_t>(n));
+        const DropoutMask<float> mask = dropout_mask(tape, dropout, 1, n);
         std::vector<float> factors(n);
-        for (size_t i = 0; i < n; ++i) factors[i] = mask.factor(static_cast<ptrdiff_t>(i));
+        for (size_t i = 0; i < n; ++i) factors[i] = mask.factor(i);
         return c.expect("dropout", {n}, factors);
     }
     const auto index = c.whole_in("index", {any}, 0, 0xFFFFFFFF);
@@ -428,10 +423,10 @@ void check_rng(Case& c) {
     std::vector<uint64_t> below;
     std::vector<float> normal;
     for (size_t i = 0; i < index.values.size(); ++i) {
-        const uint64_t at = static_cast<uint64_t>(step[i]);
+        const uint64_t at = step[i];
         const uint32_t which = static_cast<uint32_t>(index.values[i]), where = static_cast<uint32_t>(site[i]);
         uniform.push_back(random.uniform(at, which, where));
-        below.push_back(random.below(static_cast<uint64_t>(bound[i]), at, which, where));
+        below.push_back(random.below(bound[i], at, which, where));
         normal.push_back(random.normal(at, which, where));
     }
     c.expect("uniform", index.shape, uniform, true);
@@ -445,9 +440,7 @@ std::vector<int> lengths_of(Case& c, int n) {
     const auto lengths = c.whole_in("lengths", {any}, 1, std::max(n, 1));
     int64_t total = 0;
     for (const int64_t length : lengths.values) total += length;
-    if (total != n)
-        fail("check.value", "%s: case %s: in/lengths add up to %lld, but there are %d rows", c.file.path.c_str(),
-             c.name.c_str(), static_cast<long long>(total), n);
+    c.require_value(total == n, "in/lengths add up to ", total, ", but there are ", n, " rows");
     return {lengths.values.begin(), lengths.values.end()};
 }
 
@@ -466,7 +459,7 @@ void check_returns(Case& c) {
         relabel(trajectory, 1, 1, gamma);
         g.insert(g.end(), trajectory.returns_to_go.begin(), trajectory.returns_to_go.end());
         d.insert(d.end(), trajectory.discounted_returns.begin(), trajectory.discounted_returns.end());
-        at += static_cast<size_t>(length);
+        at += length;
     }
     for (const double x : g) scaled.push_back(static_cast<float>(x * scale));  // the network's input
     c.expect("g", rewards.shape, g);
@@ -482,9 +475,8 @@ template <class T>
 void check_linear(Case& c) {
     Graph<T> graph(c);
     const Tensor<T> x = graph.variable("x", {any, any});
-    const uint64_t in = static_cast<uint64_t>(x.columns);
     const bool conv1d = c.word("layout", "out_in|in_out") == "in_out";
-    const Tensor<T> weight = graph.variable("weight", conv1d ? Shape{in, any} : Shape{any, in});
+    const Tensor<T> weight = graph.variable("weight", conv1d ? shape_of(x.columns, any) : shape_of(any, x.columns));
     const int out = conv1d ? weight.columns : weight.rows;
     const Tensor<T> bias = graph.variable("bias", shape_of(out));
     const Affine<T> affine = {weight, bias, conv1d ? Layout::in_out : Layout::out_in};
@@ -505,9 +497,9 @@ template <class T>
 void check_mlp(Case& c) {
     Graph<T> graph(c);
     const Tensor<T> x = graph.variable("x", {any, any});
-    const Tensor<T> w1 = graph.variable("c_fc.weight", {static_cast<uint64_t>(x.columns), any});
+    const Tensor<T> w1 = graph.variable("c_fc.weight", shape_of(x.columns, any));
     const Tensor<T> b1 = graph.variable("c_fc.bias", shape_of(w1.columns));
-    const Tensor<T> w2 = graph.variable("c_proj.weight", {static_cast<uint64_t>(w1.columns), any});
+    const Tensor<T> w2 = graph.variable("c_proj.weight", shape_of(w1.columns, any));
     const Tensor<T> b2 = graph.variable("c_proj.bias", shape_of(w2.columns));
     const Tensor<T> hidden = linear(graph.tape, x, Affine<T>{w1, b1, Layout::in_out}, Activation::relu);
     const Tensor<T> y = linear(graph.tape, hidden, Affine<T>{w2, b2, Layout::in_out});
@@ -522,13 +514,11 @@ void check_attention(Case& c) {
     Graph<T> graph(c);
     const Tensor<T> q = graph.variable("q", {any, any}), k = graph.variable("k", shape_of(q.rows, q.columns)),
                     v = graph.variable("v", shape_of(q.rows, q.columns));
-    const int heads = static_cast<int>(c.whole("heads", 1, 1, 1 << 20)), n = q.rows, d = q.columns;
+    const int heads = c.whole<int>("heads", 1, 1, 1 << 20), n = q.rows, d = q.columns;
     const std::vector<int> lengths = lengths_of(c, n);
-    if (d % heads != 0 || n > 100000 || std::any_of(lengths.begin(), lengths.end(), [](int l) { return l > 4096; }))
-        fail("check.value",
-             "%s: case %s: %d columns, %d heads, %d rows: heads must divide columns, and there may be "
-             "100000 rows at most, 4096 in a sequence",
-             c.file.path.c_str(), c.name.c_str(), d, heads, n);
+    const bool short_enough = std::ranges::all_of(lengths, [](int length) { return length <= 4096; });
+    c.require_value(d % heads == 0 && n <= 100000 && short_enough, d, " columns, ", heads, " heads, ", n,
+                    " rows: heads must divide columns, and there may be 100000 rows at most, 4096 in a sequence");
     // Keys and values as c_attn lays them: side by side.
     const Tensor<T> kv = graph.tape.make(n, 2 * d);
     const auto each = [=](auto&& f) {
@@ -542,14 +532,14 @@ void check_attention(Case& c) {
         });
     });
     std::vector<Span> spans;
-    std::vector<int> position(static_cast<size_t>(n));
+    std::vector<int> position(n);
     std::iota(position.begin(), position.end(), 0);
     for (const int length : lengths) {
         const int first = spans.empty() ? 0 : spans.back().first_token + spans.back().tokens;
         spans.push_back({first, length, first, length});
     }
-    const Tensor<T> y = attention(graph.tape, q, kv, static_cast<int>(d), spans.data(), static_cast<int>(spans.size()),
-                                  position.data(), heads, dropout_at(graph.tape, 0, 0));
+    const Tensor<T> y = attention(graph.tape, q, kv, d, spans.data(), static_cast<int>(spans.size()), position.data(),
+                                  heads, dropout_at(graph.tape, 0, 0));
     graph.finish({{"y", shape_of(n, d), y}});
 }
 
@@ -574,12 +564,11 @@ std::unique_ptr<Transformer<T>> read_model(Case& c) {
     config.state_dim = static_cast<int>(shape("embed_state.weight")[1]);
     config.action_dim = static_cast<int>(shape("embed_action.weight")[1]);
     config.width = static_cast<int>(shape("embed_state.weight")[0]);
-    const uint64_t d = static_cast<uint64_t>(config.width);
+    const uint64_t d = config.width;
     const auto fused = [&] { return "transformer.h." + std::to_string(config.layers) + ".attn.c_attn.weight"; };
     for (; names.contains(fused()); ++config.layers)  // before anything so large is allocated
         c.check_shape(c.need("in/parameter/" + fused()), {d, 3 * d});
-    config.heads =
-        static_cast<int>(c.whole("heads", config.layers > 0 ? std::nullopt : std::optional(1.0), 1, 1 << 20));
+    config.heads = c.whole<int>("heads", config.layers > 0 ? std::nullopt : std::optional(1.0), 1, 1 << 20);
     if (names.contains("embed_ordering.weight"))
         config.max_timesteps = static_cast<int>(shape("embed_ordering.weight")[0]);
     config.head = names.contains("predict_action.logits.weight") ? Head::categorical
@@ -599,9 +588,9 @@ std::unique_ptr<Transformer<T>> read_model(Case& c) {
 // parameter/NAME; projection [projected_dim, state_dim].
 void check_initialisation(Case& c) {
     const auto size = [&](const char* name, std::optional<double> fallback, double most) {
-        return static_cast<int>(c.whole(name, fallback, fallback ? 0 : 1, most));
+        return c.whole<int>(name, fallback, fallback ? 0 : 1, most);
     };
-    const uint32_t seed = static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF));
+    const uint32_t seed = c.whole<uint32_t>("seed", {}, 0, 0xFFFFFFFF);
     TransformerConfig config{};
     config.state_dim = size("state_dim", {}, 1000);
     config.action_dim = size("action_dim", {}, 1000);
@@ -622,8 +611,8 @@ void check_initialisation(Case& c) {
     memory.action_dim = memory.K = 1;
     memory.capacity = 1;
     memory.tau = 1;
-    c.expect("projection", {static_cast<uint64_t>(memory.projected_dim), static_cast<uint64_t>(config.state_dim)},
-             EpisodicMemory(memory, seed).projection, memory.projected_dim == 0);
+    c.expect("projection", shape_of(memory.projected_dim, config.state_dim), EpisodicMemory(memory, seed).projection,
+             memory.projected_dim == 0);
 }
 
 // Windows: states [n, S], actions [n, A], returns_to_go [n], timesteps [n] and lengths [windows], packed; or [windows,
@@ -649,8 +638,7 @@ std::vector<float> squashed_actions_in(Case& c, const std::string& name, const S
 
 std::vector<float> actions_in(Case& c, const std::string& name, const Windows& windows,
                               const TransformerConfig& config) {
-    if (config.head != Head::categorical)
-        return c.in<float>(name, windows.rows_of(static_cast<uint64_t>(config.action_dim))).values;
+    if (config.head != Head::categorical) return c.in<float>(name, windows.rows_of(config.action_dim)).values;
     const auto moves = c.whole_in(name, windows.steps, 0, config.action_dim - 1);
     return {moves.values.begin(), moves.values.end()};
 }
@@ -659,21 +647,19 @@ Windows read_windows(Case& c, const TransformerConfig& config) {
     Windows windows;
     const size_t rank = c.need("in/states").shape.size();
     Shape pattern(rank == 3 ? 3 : 2, any);
-    pattern.back() = static_cast<uint64_t>(config.state_dim);
+    pattern.back() = config.state_dim;
     const Array<float> states = c.in<float>("states", pattern);
     windows.steps.assign(states.shape.begin(), states.shape.end() - 1);
     SequenceBatch& batch = windows.sequences;
     batch.states = states.values;
-    const int n = static_cast<int>(states.values.size() / static_cast<size_t>(config.state_dim));
+    const int n = static_cast<int>(states.values.size() / config.state_dim);
     if (rank == 3)
         batch.lengths.assign(windows.steps[0], states.extent(1));
     else
         batch.lengths = lengths_of(c, n);
     const int longest = batch.lengths.empty() ? 0 : *std::max_element(batch.lengths.begin(), batch.lengths.end());
-    if (n < 1 || n > 1000000 || longest > 1000)
-        fail("check.value",
-             "%s: case %s: %d steps, %d in the longest window; there must be 1 to a million, and at most 1000",
-             c.file.path.c_str(), c.name.c_str(), n, longest);
+    c.require_value(n >= 1 && n <= 1000000 && longest <= 1000, n, " steps, ", longest,
+                    " in the longest window; there must be 1 to a million, and at most 1000");
     batch.returns_to_go = c.in<float>("returns_to_go", windows.steps).values;
     if (c.has("in/timesteps")) {
         const auto timesteps = c.whole_in("timesteps", windows.steps, 0, 1 << 30);
@@ -722,9 +708,9 @@ void check_tokens(Case& c) {
     const Windows windows = read_windows(c, model->config);
     Tape<T> tape(c.compute);
     model->config.dropout = static_cast<float>(c.number("dropout", 0, 0, 0.99));
-    tape.dropout_random = {static_cast<uint32_t>(c.whole("seed", 0, 0, 0xFFFFFFFF)), Stream::dropout};
-    tape.dropout_step = static_cast<uint64_t>(c.whole("update", 0, 0, 0x1p53));
-    tape.part = static_cast<size_t>(c.whole("part", 0, 0, 4095));
+    tape.dropout_random = {c.whole<uint32_t>("seed", 0, 0, 0xFFFFFFFF), Stream::dropout};
+    tape.dropout_step = c.whole<uint64_t>("update", 0, 0, 0x1p53);
+    tape.part = c.whole<size_t>("part", 0, 0, 4095);
     LayerOutputs<T> layers;
     layers.watch(tape);
     forward(tape, *model, windows.sequences, Queries::every_state);
@@ -765,7 +751,7 @@ void check_acting(Case& c) {
     const auto model = read_model<float>(c);
     const TransformerConfig& config = model->config;
     const bool discrete = config.head == Head::categorical;
-    const uint64_t S = static_cast<uint64_t>(config.state_dim), A = static_cast<uint64_t>(config.action_dim);
+    const uint64_t S = config.state_dim, A = config.action_dim;
     const Array<float> states = c.in<float>("states", {any, S});
     const uint64_t T = states.shape[0];
     const Array<double> rewards = c.in<double>("rewards", {T});
@@ -775,11 +761,9 @@ void check_acting(Case& c) {
     settings.eval_context = c.whole("eval_context", {}, 1, 1000);
     settings.context_length = c.whole("context_length", {}, 1, 1000);
     const double target = c.number("target", {}, -1e9, 1e9);
-    const uint64_t number = samples ? static_cast<uint64_t>(c.whole("episode", 0, 0, 0x1p53)) : 0;
-    const Random random{samples ? static_cast<uint32_t>(c.whole("seed", {}, 0, 0xFFFFFFFF)) : 0, Stream::exploration};
-    if (T < 1 || T > 10000)
-        fail("check.value", "%s: case %s: an episode of %llu steps, expected 1 to 10000", c.file.path.c_str(),
-             c.name.c_str(), static_cast<unsigned long long>(T));
+    const uint64_t number = samples ? c.whole<uint64_t>("episode", 0, 0, 0x1p53) : 0;
+    const Random random{samples ? c.whole<uint32_t>("seed", {}, 0, 0xFFFFFFFF) : 0, Stream::exploration};
+    c.require_value(T >= 1 && T <= 10000, "an episode of ", T, " steps, expected 1 to 10000");
     EnvironmentSpec spec{};
     spec.state_dim = config.state_dim;
     spec.action_dim = discrete ? 1 : config.action_dim;
@@ -795,7 +779,7 @@ void check_acting(Case& c) {
     Recording environment(states, rewards);
     Episode episode{};
     Episode* const running[] = {&episode};
-    episode.state.assign(states.values.begin(), states.values.begin() + static_cast<ptrdiff_t>(S));
+    episode.state.assign(states.values.begin(), states.values.begin() + S);
     Tape<float> tape(c.compute);
     tape.recording = false;
     std::vector<int> lengths, timesteps;
@@ -908,9 +892,9 @@ void check_policy_discrete(Case& c) {
         std::vector<int> likely, sampled;
         const auto uniform = c.has("in/uniform") ? c.uniform_in("uniform", rows) : c.in_or<double>("uniform", rows, 0);
         for (int row = 0; row < logits.rows; ++row) {
-            const float* p = log_p.value + static_cast<ptrdiff_t>(row) * logits.columns;
+            const float* p = log_p.value + ptrdiff_t{row} * logits.columns;
             likely.push_back(most_likely_action(p, logits.columns));
-            sampled.push_back(sampled_action(p, logits.columns, uniform.values[static_cast<size_t>(row)]));
+            sampled.push_back(sampled_action(p, logits.columns, uniform.values[row]));
         }
         c.expect("most_likely", rows, likely, true);
         if (c.has("in/uniform")) c.expect("sampled", rows, sampled);
@@ -947,8 +931,8 @@ MemoryConfig memory_settings(Case& c, int state_dim, int action_dim, int project
     config.action_dim = action_dim;
     config.projected_dim = projected_dim;
     // A capacity above the number of rows changes nothing, so no more is allocated.
-    config.capacity = std::min(n + 1, static_cast<size_t>(c.whole("capacity", static_cast<double>(n + 1), 1, 1e12)));
-    config.K = static_cast<int>(c.whole("K", 1, 1, 100000));
+    config.capacity = std::min(n + 1, c.whole<size_t>("capacity", static_cast<double>(n + 1), 1, 1e12));
+    config.K = c.whole<int>("K", 1, 1, 100000);
     config.epsilon = c.number("epsilon", INFINITY, 0, INFINITY);
     config.tau = c.number("tau", 1, 1e-9, 1e9);
     config.exclude_self = c.whole("exclude_self", 0, 0, 1) == 1;
@@ -972,11 +956,11 @@ Table empty_table(Case& c) {
 }
 
 void take_in(Table& table, size_t row, EpisodicMemory::Changes& changes) {
-    const auto state = table.states.values.begin() + static_cast<ptrdiff_t>(row * table.memory.S),
-               action = table.actions.values.begin() + static_cast<ptrdiff_t>(row * table.memory.A);
+    const auto state = table.states.values.begin() + row * table.memory.S,
+               action = table.actions.values.begin() + row * table.memory.A;
     Trajectory step;
-    step.states.assign(state, state + static_cast<ptrdiff_t>(table.memory.S));
-    step.actions.assign(action, action + static_cast<ptrdiff_t>(table.memory.A));
+    step.states.assign(state, state + table.memory.S);
+    step.actions.assign(action, action + table.memory.A);
     step.rewards = {0};
     step.discounted_returns = {table.e.values[row]};
     const EpisodicMemory::Changes now = table.memory.update(step);
@@ -1039,9 +1023,8 @@ void check_memory_update(Case& c) {
 Neighbourhoods look_up(Case& c, const Table& table, uint64_t& m) {
     const auto query = c.in<float>("query", {any, table.states.shape[1]});
     m = query.shape[0];
-    if (m * static_cast<uint64_t>(table.memory.config.K) > 100000000)
-        fail("check.value", "%s: case %s: %llu queries of %d neighbours are more than 10^8", c.file.path.c_str(),
-             c.name.c_str(), static_cast<unsigned long long>(m), table.memory.config.K);
+    const int K = table.memory.config.K;
+    c.require_value(m * K <= 100000000, m, " queries of ", K, " neighbours are more than 10^8");
     return table.memory.search(query.values.data(), m);
 }
 
@@ -1125,12 +1108,11 @@ Batch read_batch(Case& c, const Windows& windows, const TransformerConfig& confi
     batch.weights = c.in_or<float>("weights", windows.steps, 1).values;
     if (config.head == Head::squashed_gaussian)
         for (const char* name : {"actions", "remembered_actions"})
-            if (c.has(std::string("in/") + name))
-                squashed_actions_in(c, name, windows.rows_of(static_cast<uint64_t>(config.action_dim)));
+            if (c.has(std::string("in/") + name)) squashed_actions_in(c, name, windows.rows_of(config.action_dim));
     if (c.has("in/weights")) c.in_range("weights", windows.steps, 0.0f, 1.0f, "from 0 to 1");
     const std::vector<int>& lengths = windows.sequences.lengths;
     for (const int length : lengths)
-        batch.coefficients.insert(batch.coefficients.end(), static_cast<size_t>(length),
+        batch.coefficients.insert(batch.coefficients.end(), length,
                                   1.0 / (static_cast<double>(lengths.size()) * length));
     return batch;
 }
@@ -1267,7 +1249,7 @@ void check_objective(Case& c) {
     const Batch batch = read_batch(c, windows, config);
     const bool constrain = config.head != Head::deterministic;
     std::vector<float> noise;
-    if (gaussian) noise = c.in<float>("noise", windows.rows_of(static_cast<uint64_t>(config.action_dim))).values;
+    if (gaussian) noise = c.in<float>("noise", windows.rows_of(config.action_dim)).values;
     const double log_lambda = constrain ? c.number("log_temperature", std::log(0.1), -50, 50) : 0;
     const T lambda = static_cast<T>(std::exp(static_cast<T>(log_lambda)));
     const Objective<T> result = objective(graph.tape, policy, batch, noise.data(), lambda, constrain);
@@ -1306,9 +1288,9 @@ void check_optimizer(Case& c) {
     config.weight_decay = c.number("weight_decay", 0, 0, 1e9);
     config.always_adapt = c.whole("always_adapt", 0, 0, 1) == 1;
     config.clip_norm = c.number("clip_norm", config.clip_norm, 0, 1e9);
-    config.warmup_updates = static_cast<uint64_t>(c.whole("warmup_updates", 0, 0, 1e9));
+    config.warmup_updates = c.whole<uint64_t>("warmup_updates", 0, 0, 1e9);
     Optimizer optimizer;
-    optimizer.updates = static_cast<uint64_t>(c.whole("updates_before", 0, 0, 1e9));
+    optimizer.updates = c.whole<uint64_t>("updates_before", 0, 0, 1e9);
     std::vector<Parameter<float>> parameters;
     std::vector<Array<float>> gradients;
     std::vector<std::vector<float>> after;
@@ -1317,9 +1299,8 @@ void check_optimizer(Case& c) {
     for (const std::string& name : c.named("in/parameter/")) {
         Shape shape = c.need("in/parameter/" + name).shape;
         const Array<float> value = c.in<float>("parameter/" + name, shape);
-        if (value.values.empty() || shape.empty())
-            fail("check.shape", "%s: has shape %s, expected one axis or more, and an entry",
-                 c.where(c.need("in/parameter/" + name)).c_str(), shape_text(shape).c_str());
+        require(!value.values.empty() && !shape.empty(), "check.shape", c.where(c.need("in/parameter/" + name)),
+                ": has shape ", shape_text(shape), ", expected one axis or more, and an entry");
         parameters.push_back({name, shape, value.values, std::vector<float>(value.values.size())});
         shape.insert(shape.begin(), steps);
         gradients.push_back(c.in<float>("gradient/" + name, shape));
@@ -1333,8 +1314,8 @@ void check_optimizer(Case& c) {
     for (size_t step = 0; step < steps; ++step) {
         const auto before = values_of(parameters);
         for (size_t p = 0; p < parameters.size(); ++p)
-            std::copy_n(gradients[p].values.begin() + static_cast<ptrdiff_t>(step * parameters[p].value.size()),
-                        parameters[p].value.size(), parameters[p].gradient.begin());
+            std::copy_n(gradients[p].values.begin() + step * parameters[p].value.size(), parameters[p].value.size(),
+                        parameters[p].gradient.begin());
         norms.push_back(update_parameters(c.compute, parameters, optimizer, config));
         slack.add(before, std::vector<double>(parameters.size()), 1, optimizer, config);
         for (size_t p = 0; p < parameters.size(); ++p) {
@@ -1358,17 +1339,15 @@ void check_sampling(Case& c) {
     const auto rewards = c.in<float>("rewards", {any});
     const std::vector<int> lengths = lengths_of(c, rewards.extent(0));
     const size_t count = lengths.size();
-    const size_t initial =
-        static_cast<size_t>(c.whole("initial", static_cast<double>(count), 0, static_cast<double>(count)));
-    const int context_length = static_cast<int>(c.whole("context_length", 20, 1, 1 << 30));
+    const size_t initial = c.whole<size_t>("initial", static_cast<double>(count), 0, static_cast<double>(count));
+    const int context_length = c.whole<int>("context_length", 20, 1, 1 << 30);
     ReplayBuffer buffer{
-        1,  1, 1.0, static_cast<size_t>(c.whole("capacity", static_cast<double>(std::max<size_t>(count, 1)), 1, 1e9)),
-        {}, 0, {}};
+        1, 1, 1.0, c.whole<size_t>("capacity", static_cast<double>(std::max<size_t>(count, 1)), 1, 1e9), {}, 0, {}};
     std::vector<Trajectory> trajectories;
     size_t at = 0;
     for (size_t i = 0; i < count; ++i) {
         Trajectory trajectory;
-        const auto first = rewards.values.begin() + static_cast<ptrdiff_t>(at);
+        const auto first = rewards.values.begin() + at;
         trajectory.rewards.assign(first, first + lengths[i]);
         trajectory.states.assign(trajectory.rewards.size(), static_cast<float>(i));
         trajectory.actions = trajectory.states;
@@ -1376,7 +1355,7 @@ void check_sampling(Case& c) {
         trajectories.push_back(trajectory);
         at += trajectory.rewards.size();
     }
-    const auto middle = trajectories.begin() + static_cast<ptrdiff_t>(initial);
+    const auto middle = trajectories.begin() + initial;
     buffer.start(offline_set({trajectories.begin(), middle}, c.whole("keep_lowest", 1, 0, 1) == 1));
     for (auto next = middle; next != trajectories.end(); ++next) buffer.add(*next);
     std::vector<int> order;
@@ -1389,11 +1368,10 @@ void check_sampling(Case& c) {
     const Shape windows = {draws.shape[0]};
     std::vector<int> trajectory, start, length;
     for (size_t i = 0; i < windows[0]; ++i) {
-        if (uniform && (draws.values[2 * i] >= static_cast<int64_t>(order.size()) ||
-                        draws.values[2 * i + 1] >= buffer.trajectories[draws.values[2 * i]].length()))
-            fail("check.value", "%s: case %s: draw %zu names no step of the buffer", c.file.path.c_str(),
-                 c.name.c_str(), i);
-        uint64_t step = static_cast<uint64_t>(draws.values[uniform ? 2 * i + 1 : i]);
+        c.require_value(!uniform || (draws.values[2 * i] < std::ssize(order) &&
+                                     draws.values[2 * i + 1] < buffer.trajectories[draws.values[2 * i]].length()),
+                        "draw ", i, " names no step of the buffer");
+        uint64_t step = draws.values[uniform ? 2 * i + 1 : i];
         if (uniform && draws.values[2 * i] > 0) step += buffer.ends[draws.values[2 * i] - 1];
         const Window window = buffer.window_at(step, context_length);
         trajectory.push_back(static_cast<int>(window.trajectory));
@@ -1418,7 +1396,7 @@ void check_normalize(Case& c) {
         return c.expect("score", returns.shape, score);
     }
     const auto states = c.in<float>("states", {any, any});
-    if (states.values.empty()) fail("check.shape", "%s: has no entry", c.where(c.need("in/states")).c_str());
+    require(!states.values.empty(), "check.shape", c.where(c.need("in/states")), ": has no entry");
     Trajectory trajectory;
     trajectory.states = states.values;
     const Normaliser normaliser = fit_normaliser({trajectory}, states.extent(1));
@@ -1459,7 +1437,7 @@ void check_gridworld(Case& c) {
         next.push_back(next_cell(edge, static_cast<int>(cell.values[i]), static_cast<int>(move.values[i])));
         if (!steps) continue;
         const float action = static_cast<float>(move.values[i]);
-        std::vector<float> observed(static_cast<size_t>(world.spec().state_dim));
+        std::vector<float> observed(world.spec().state_dim);
         world.cell = static_cast<int>(cell.values[i]);
         const Step step = world.step(&action, observed.data());
         reward.push_back(step.reward);
@@ -1470,7 +1448,7 @@ void check_gridworld(Case& c) {
     if (!steps) return;
     c.expect("reward", cell.shape, reward, true);
     c.expect("terminated", cell.shape, terminated, true);
-    c.expect("state", {cell.shape[0], static_cast<uint64_t>(world.spec().state_dim)}, state, true);
+    c.expect("state", shape_of(cell.shape[0], world.spec().state_dim), state, true);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1492,10 +1470,9 @@ int wanted_updates(Case& c) {
                     most = std::max(most, static_cast<int>(std::min<uint64_t>(extent, 1 << 20)));
     }
     constexpr int limit = 1000;
-    if (most > limit)
-        fail("check.value", "%s: case %s asks for %d updates, %d are the most: rounding grows from update to update",
-             c.file.path.c_str(), c.name.c_str(), most, limit);
-    return static_cast<int>(c.whole("updates", most, most, limit));
+    c.require_value(most <= limit, "asks for ", most, " updates, ", limit,
+                    " are the most: rounding grows from update to update");
+    return c.whole<int>("updates", most, most, limit);
 }
 
 // Moments of an optimiser that has made updates before: first_moment/NAME, second_moment/NAME; left out: zeros.
@@ -1530,7 +1507,7 @@ void check_advice(Case& c) {
     std::vector<float> a_hat;
     for (size_t i = 0; i < n; ++i) {
         std::vector<Neighbour> found;
-        for (size_t k = i * K; k < i * K + static_cast<size_t>(count.values[i]); ++k)
+        for (size_t k = i * K; k < i * K + count.values[i]; ++k)
             found.push_back({distance.values[k], static_cast<uint32_t>(k)});
         e_hat.push_back(approximate_return(memory, found));
         w.push_back(EpisodicMemory::weight(memory.is_optimal(found, d.values[i]), alpha));
@@ -1548,7 +1525,7 @@ std::vector<double> gradient_off(const std::vector<Parameter<float>>& parameters
     std::vector<double> off;
     for (const Parameter<float>& parameter : parameters) {
         double largest = 0;
-        for (const float g : parameter.gradient) largest = std::max(largest, std::fabs(static_cast<double>(g)));
+        for (const float g : parameter.gradient) largest = std::max(largest, std::fabs(double{g}));
         off.push_back(relative * largest);
     }
     return off;
@@ -1578,15 +1555,15 @@ void check_step(Case& c) {
     std::vector<float> noise;
     size_t noise_stride = 0;
     if (config.head == Head::squashed_gaussian) {
-        Shape shape = windows.rows_of(static_cast<uint64_t>(config.action_dim));
+        Shape shape = windows.rows_of(config.action_dim);
         if (c.need("in/noise").shape.size() > shape.size()) {
             noise_stride = batch.actions.size();
-            shape.insert(shape.begin(), static_cast<uint64_t>(wanted));
+            shape.insert(shape.begin(), wanted);
         }
         noise = c.in<float>("noise", shape).values;
     }
     Optimizer optimizer;
-    optimizer.updates = static_cast<uint64_t>(c.whole("updates_before", 0, 0, 1e15));
+    optimizer.updates = c.whole<uint64_t>("updates_before", 0, 0, 1e15);
     read_moments(c, model->parameters, optimizer);
     CheckedTemperature lambda;
     lambda.start(log_lambda);
@@ -1603,7 +1580,7 @@ void check_step(Case& c) {
         if (update == 1) layers.watch(tape);
         const double temperature =
             std::is_same_v<T, float> ? static_cast<double>(lambda.temperature.lambda()) : std::exp(log_lambda);
-        const float* update_noise = noise.data() + static_cast<size_t>(update - 1) * noise_stride;
+        const float* update_noise = noise.data() + (update - 1) * noise_stride;
         const Objective<T> result = learn(tape, *model, batch, update_noise, static_cast<T>(temperature), constrain);
         tape.watch = nullptr;
         lists["L"].push_back(static_cast<double>(result.L.value[0]));
@@ -1655,12 +1632,12 @@ void check_step(Case& c) {
 void check_environment(Case& c) {
     const std::string name = c.file.text("topic").substr(4);
     const MujocoTask* task = find_mujoco_task(name);
-    if (!task || name != task->name)
-        fail("check.topic", "%s: unknown task \"%s\"; wodtem tasks lists them", c.file.path.c_str(), name.c_str());
+    require(task && name == task->name, "check.topic", c.file.path, ": unknown task \"", name,
+            "\"; wodtem tasks lists them");
 #ifdef WODTEM_MUJOCO
     MujocoEnvironment environment(*task, static_cast<Physics>(index_of(physics_names, c.word("physics", "d4rl|2.2"))));
-    const uint64_t nq = static_cast<uint64_t>(environment.model->nq), nv = static_cast<uint64_t>(environment.model->nv),
-                   A = static_cast<uint64_t>(task->action_dim), S = static_cast<uint64_t>(task->state_dim);
+    const uint64_t nq = environment.model->nq, nv = environment.model->nv;
+    const uint64_t A = task->action_dim, S = task->state_dim;
     const auto qpos = c.in<double>("qpos", {any, nq}), qvel = c.in<double>("qvel", {qpos.shape[0], nv});
     const bool several = c.need("in/actions").shape.size() == 3;
     const auto actions = c.in<double>("actions", several ? Shape{qpos.shape[0], any, A} : Shape{qpos.shape[0], A});
@@ -1744,30 +1721,27 @@ std::vector<std::string> cases_of(const TensorFile& file) {
         const size_t slash = tensor.name.find('/');
         const std::string name = tensor.name.substr(0, slash);
         const std::string rest = slash == std::string::npos ? "" : tensor.name.substr(slash + 1);
-        if (name.empty() || name.find('.') != std::string::npos ||
-            !(rest.starts_with("in/") || rest.starts_with("out/")))
-            fail("check.name", "%s: tensor %s at byte %zu belongs to no case; names are CASE/in/NAME and CASE/out/NAME",
-                 file.path.c_str(), json_string(tensor.name).c_str(), file.data_start + tensor.begin);
+        const bool part = rest.starts_with("in/") || rest.starts_with("out/");
+        require(part && !name.empty() && name.find('.') == std::string::npos, "check.name", file.path, ": tensor ",
+                json_string(tensor.name), " at byte ", file.data_start + tensor.begin,
+                " belongs to no case; names are CASE/in/NAME and CASE/out/NAME");
         if (known.insert(name).second) cases.push_back(name);
     }
     for (const auto& [key, text] : file.metadata) {
         const size_t dot = key.find('.');
-        if (dot != std::string::npos && !known.contains(key.substr(0, dot)))
-            fail("check.case", "%s: metadata entry %s names a case of which the file has no tensor", file.path.c_str(),
-                 json_string(key).c_str());
+        require(dot == std::string::npos || known.contains(key.substr(0, dot)), "check.case", file.path,
+                ": metadata entry ", json_string(key), " names a case of which the file has no tensor");
     }
     const std::string& count = file.text("cases");
-    if (count != std::to_string(cases.size()))
-        fail("check.count", "%s: metadata entry \"cases\" says %s, the file has %zu", file.path.c_str(),
-             json_string(count.substr(0, 80)).c_str(), cases.size());
-    if (cases.empty()) fail("check.count", "%s: has no case", file.path.c_str());
+    require(count == std::to_string(cases.size()), "check.count", file.path, ": metadata entry \"cases\" says ",
+            json_string(count.substr(0, 80)), ", the file has ", cases.size());
+    require(!cases.empty(), "check.count", file.path, ": has no case");
     return cases;
 }
 
 // Text of a file without control characters, which could drive the terminal.
 std::string printable(std::string text) {
-    for (char& c : text)
-        if (static_cast<unsigned char>(c) < ' ' || c == 0x7F) c = '?';
+    std::ranges::replace_if(text, is_control, '?');
     return text;
 }
 
@@ -1788,8 +1762,7 @@ std::string first_not_finite(const Case& c) {
         const std::vector<long double> values = c.file.numbers<long double>(tensor);
         const auto bad = std::find_if_not(values.begin(), values.end(), [](long double x) { return std::isfinite(x); });
         if (!text.empty() || bad == values.end()) continue;
-        text = c.where(tensor) + ": entry " + place(tensor.shape, static_cast<size_t>(bad - values.begin())) + " is " +
-               shown(*bad);
+        text = c.where(tensor) + ": entry " + place(tensor.shape, bad - values.begin()) + " is " + shown(*bad);
     }
     return text;
 }
@@ -1813,9 +1786,8 @@ void check_case(Case& c, const Topic& topic) {
     for (const char* what : {"note", "source", "result"}) c.used.insert(c.name + "." + what);
     c.tolerance("");
     const std::set<std::string> outputs = c.named("out/");
-    if (outputs.empty() && expected_error(c).empty())
-        fail("check.missing", "%s: case %s has no CASE/out/NAME: nothing is expected of it", c.file.path.c_str(),
-             json_string(c.name).c_str());
+    require(!outputs.empty() || !expected_error(c).empty(), "check.missing", c.file.path, ": case ",
+            json_string(c.name), " has no CASE/out/NAME: nothing is expected of it");
     if (!outputs.empty() && !expected_error(c).empty())
         fail("check.unknown", "%s: is not looked at, for CASE.result says that an error is expected; leave one out",
              c.where(c.need("out/" + *outputs.begin())).c_str());
@@ -1837,11 +1809,8 @@ void check_case(Case& c, const Topic& topic) {
         if (c.used.contains(key)) continue;
         const std::string start = c.name + ".tolerance.";
         const bool of_output = key.starts_with(start) && !c.named("out/" + key.substr(start.size())).empty();
-        if (!of_output)
-            fail("check.unknown",
-                 "%s: metadata entry %s is unknown to topic %s; tests/vectors/README.md lists its "
-                 "settings",
-                 c.file.path.c_str(), json_string(key).c_str(), topic.name);
+        require(of_output, "check.unknown", c.file.path, ": metadata entry ", json_string(key), " is unknown to topic ",
+                topic.name, "; tests/vectors/README.md lists its settings");
     }
 }
 
@@ -1853,9 +1822,8 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
     const Topic* topic = nullptr;
     for (const Topic& t : topics)
         if (name == t.name || (std::string_view(t.name) == "env_" && name.starts_with("env_"))) topic = &t;
-    if (!topic)
-        fail("check.topic", "%s: unknown topic %s; known are those of tests/vectors/README.md", path.c_str(),
-             json_string(name.substr(0, 80)).c_str());
+    require(topic, "check.topic", path, ": unknown topic ", json_string(name.substr(0, 80)),
+            "; known are those of tests/vectors/README.md");
     double worst = 0;
     std::vector<Case> failed;
     std::optional<Error> malformed;  // the first; more are printed like what does not hold
@@ -1905,8 +1873,8 @@ bool check_file(const std::string& path, Compute& compute, bool verbose) {
 
 void command_check(const Arguments& arguments) {
     const bool dumps = !arguments["--dump"].empty();
-    if (dumps == arguments["--run"].empty() || dumps != arguments.words.empty())
-        fail("usage.words", "wodtem check takes vector files, or --dump FILE --run DIR");
+    require(dumps != arguments["--run"].empty() && dumps == arguments.words.empty(), "usage.words",
+            "wodtem check takes vector files, or --dump FILE --run DIR");
     if (dumps) return vectors::dump_run(arguments["--dump"], {arguments["--run"]}, arguments);
     Compute compute(kernel_of(arguments), thread_count(arguments));
     size_t bad = 0;
@@ -1919,5 +1887,5 @@ void command_check(const Arguments& arguments) {
             ++bad;
         }
     }
-    if (bad > 0) fail("check.failed", "%zu of %zu files do not hold", bad, arguments.words.size());
+    require(bad == 0, "check.failed", bad, " of ", arguments.words.size(), " files do not hold");
 }

@@ -53,8 +53,8 @@ void dump_settings(Dump& dump, const Run& run) {
 // The batch, and of each step what the memory knows: its neighbours (count of them; distance, e and action of each,
 // closest first), d, the number that draws a-hat -> e_hat, w, a_hat (NaN: none is drawn).
 void dump_batch(Dump& dump, const Run& run, const Batch& batch, const std::vector<float>& noise) {
-    const uint64_t n = batch.coefficients.size(), A = static_cast<uint64_t>(run.agent.spec.action_dim),
-                   S = static_cast<uint64_t>(run.agent.spec.state_dim), K = batch.neighbours.K;
+    const uint64_t n = batch.coefficients.size(), K = batch.neighbours.K;
+    const uint64_t A = run.agent.spec.action_dim, S = run.agent.spec.state_dim;
     const Shape actions = run.agent.spec.discrete_actions > 0 ? Shape{n} : Shape{n, A};
     const std::vector<int>& lengths = batch.sequences.lengths;
     dump.add("in/lengths", {lengths.size()}, std::vector<int64_t>(lengths.begin(), lengths.end()));
@@ -144,18 +144,13 @@ void dump_update(Run& run, const std::string& path) {
 void dump_run(const std::string& path, RunFolder folder, const Arguments& arguments) {
     Settings settings = settings_from_text(read_file(folder.file("settings"), 1 << 20), folder.file("settings"));
     const bool resumes = folder.has("checkpoint.safetensors");
-    if (settings.first_weights != "none" && !resumes)
-        fail("dump.weights",
-             "%s began with a model's weights, which it does not hold; dump it while it has a checkpoint",
-             folder.path.c_str());
+    require(settings.first_weights == "none" || resumes, "dump.weights", folder.path,
+            " began with a model's weights, which it does not hold; dump it while it has a checkpoint");
     if (settings.behaviour == "recorded") {
         const PublishedDataSet* published = find_published(settings.task);
-        if (arguments["--dataset"].empty() && !published)
-            fail("dump.dataset", "%s: give its data set by --dataset", folder.path.c_str());
-        find_data_again(
-            settings,
-            arguments["--dataset"].empty() ? find_data_set(*published) : data_set_file(arguments["--dataset"]),
-            folder.path);
+        const std::string& given = arguments["--dataset"];
+        require(published || !given.empty(), "dump.dataset", folder.path, ": give its data set by --dataset");
+        find_data_again(settings, given.empty() ? find_data_set(*published) : data_set_file(given), folder.path);
     }
     for (const std::string& input :
          {folder.file("settings"), folder.file("checkpoint.safetensors"), settings.dataset_path})
