@@ -54,9 +54,9 @@ inline sac::Network<float> embedded_policy(const std::string& name) {
 
 // A policy must fit the task's states and actions. Errors: collect.policy.
 inline void check_policy(const sac::Network<float>& policy, int inputs, int actions) {
-    if (policy.inputs() != inputs || policy.outputs() != 2 * actions)
-        fail("collect.policy", "the policy has %d inputs and %d actions, expected %d and %d; give this task's policy",
-             policy.inputs(), policy.outputs() / 2, inputs, actions);
+    require(policy.inputs() == inputs && policy.outputs() == 2 * actions, "collect.policy", "the policy has ",
+            policy.inputs(), " inputs and ", policy.outputs() / 2, " actions, expected ", inputs, " and ", actions,
+            "; give this task's policy");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -309,9 +309,8 @@ inline CollectedRows<double> retrace(const sac::Learner& learner, const MujocoTa
             environment.reset({learner.settings.seed, Stream::environment}, episode_of(back), state.data());
         environment.recording = back <= steps;
         environment.step(replay.action(row), state.data());
-        if (!std::equal(state.begin(), state.end(), replay.next_state(row)))
-            fail("collect.replay", "episode %s went another way when it was played again",
-                 std::to_string(episode_of(back)).c_str());
+        require(std::equal(state.begin(), state.end(), replay.next_state(row)), "collect.replay", "episode ",
+                episode_of(back), " went another way when it was played again");
         if (back > 1 && episode_of(back) == episode_of(back - 1)) continue;
         // Cut by a breakdown of the simulation, or by the end of the run: a timeout, as at the end of D4RL's blocks.
         if (rows.terminals.back() == 0) rows.timeouts.back() = 1;
@@ -364,7 +363,7 @@ inline void collect_data_set_file(const std::string& id, const std::string& path
     const Origin origin{
         "wodtem collect " + id + " --steps " + std::to_string(steps) + " --seed " + std::to_string(seed), seed};
     const MujocoTask* task = find_mujoco_task(id);
-    if (!task && id != walker_name) fail("collect.task", "no task of this program has data sets named %s", id.c_str());
+    require(task || id == walker_name, "collect.task", "no task of this program has data sets named ", id);
     const auto policy = [&](const std::string& name) {
         return policy_path.empty() ? embedded_policy(name) : sac::policy_of(read_safetensors(policy_path));
     };
@@ -431,11 +430,11 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
         fail("usage.task", "collect makes stand-ins for the paper's data sets, and \"%s\" is none%s", id.c_str(),
              nearest_hint(id, names).c_str());
     }
-    if (walker && steps > 0)
-        fail("usage.option", "collect %s trains a policy and makes no rows; leave --steps out", id.c_str());
-    if (!policy.empty() && (walker || id.starts_with("maze2d") || id.find("-medium-replay") != std::string::npos))
-        fail("usage.option", "no given policy acts in %s, which %s; leave --policy out", id.c_str(),
-             id.starts_with("maze2d") ? "a planner and a controller make" : "is made by training one");
+    require(!walker || steps == 0, "usage.option", "collect ", id,
+            " trains a policy and makes no rows; leave --steps out");
+    const bool planned = id.starts_with("maze2d"), trained = walker || id.find("-medium-replay") != std::string::npos;
+    require(policy.empty() || !(planned || trained), "usage.option", "no given policy acts in ", id, ", which ",
+            planned ? "a planner and a controller make" : "is made by training one", "; leave --policy out");
     if (steps == 0 && set) steps = static_cast<int64_t>(set->steps);
     const std::string name = walker ? id + ".safetensors" : file_name(*set);
     const std::string path = out.empty() ? std::string(own_folder) + "/" + name : out;

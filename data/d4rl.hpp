@@ -245,9 +245,9 @@ inline bool is_minari(const Hdf5File& file) {
 // Errors: dataset.episodes if an attribute states another number of episodes or steps than there are.
 inline void require_stated(const Hdf5File& file, const char* attribute, size_t count) {
     const auto stated = file.attributes.find(attribute);
-    if (stated != file.attributes.end() && stated->second != static_cast<double>(count))
-        fail("dataset.episodes", "%s: its attribute %s says %g, but it holds %zu; is a part missing?",
-             file.path.c_str(), attribute, stated->second, count);
+    if (stated == file.attributes.end()) return;
+    require(stated->second == static_cast<double>(count), "dataset.episodes", file.path, ": its attribute ", attribute,
+            " says ", stated->second, ", but it holds ", count, "; is a part missing?");
 }
 
 // The numbers of Minari's episodes, ascending; some may be missing between them. Errors: dataset.episodes if the file

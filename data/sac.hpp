@@ -76,8 +76,9 @@ struct Replay {
     void visit(auto& archive) {
         archive("replay.next", next);
         archive("replay.rows", rows);
-        if (rows.size() % width() != 0 || size() > capacity || (size() < capacity ? next != size() : next >= capacity))
-            fail("checkpoint.shape", "the replay's rows do not fit its width, %zu", width());
+        const bool fits = size() < capacity ? next == size() : size() == capacity && next < capacity;
+        require(fits && rows.size() % width() == 0, "checkpoint.shape", "the replay's rows do not fit its width, ",
+                width());
     }
 };
 
@@ -357,12 +358,10 @@ struct Learner {
           spec(e),
           learning(compute),
           acting(compute) {
-        if (e.discrete_actions != 0 || s.capacity < static_cast<uint64_t>(e.max_episode_steps) || s.batch < 1 ||
-            s.steps_per_update < 1)
-            fail("sac.settings",
-                 "SAC needs continuous actions, batch and steps_per_update of at least 1, and a replay of at least one "
-                 "episode (%d steps)",
-                 e.max_episode_steps);
+        const bool holds_an_episode = s.capacity >= static_cast<uint64_t>(e.max_episode_steps);
+        require(e.discrete_actions == 0 && holds_an_episode && s.batch >= 1 && s.steps_per_update >= 1, "sac.settings",
+                "SAC needs continuous actions, batch and steps_per_update of at least 1, and a replay of an episode, ",
+                e.max_episode_steps, " steps, or more");
         replay.rows.reserve(s.capacity * replay.width());  // address space; the system gives memory at the first write
     }
 
@@ -453,9 +452,8 @@ struct Learner {
             environment.reset(Random{settings.seed, Stream::environment}, progress.episodes, found.data());
         for (uint64_t back = progress.episode_steps; back > 0; --back)
             environment.step(replay.action(replay.recent(back)), found.data());
-        if (found != state)
-            fail("sac.resume", "the present episode (%s) went another way; resume on the machine that began it",
-                 std::to_string(progress.episodes).c_str());
+        require(found == state, "sac.resume", "the present episode (", progress.episodes,
+                ") went another way; resume on the machine that began it");
     }
 
     void visit(auto& archive) {
@@ -473,9 +471,8 @@ struct Learner {
                 archive("target" + number + "." + parameter.name, parameter.value);
         }
         replay.visit(archive);
-        if (progress.episode_steps > replay.size())
-            fail("checkpoint.shape", "an episode of %s steps is not in the replay",
-                 std::to_string(progress.episode_steps).c_str());
+        require(progress.episode_steps <= replay.size(), "checkpoint.shape", "an episode of ", progress.episode_steps,
+                " steps is not in the replay");
     }
 };
 
@@ -512,12 +509,10 @@ inline void save_checkpoint(const std::string& path, Learner& learner, const std
 // half of the checkpoint and must be dropped.
 inline void load_checkpoint(const std::string& path, Learner& learner, const std::string& note) {
     const TensorFile file = read_own_safetensors(path);
-    if (file.text("format") != "wodtem sac checkpoint 2")
-        fail("sac.checkpoint", "%s: is not a SAC checkpoint of this version; remove it to train anew", path.c_str());
-    const std::string wanted = settings_text(learner, note);
-    if (file.text("settings") != wanted)
-        fail("sac.checkpoint", "%s: was made with %s, this run has %s", path.c_str(), file.text("settings").c_str(),
-             wanted.c_str());
+    require(file.text("format") == "wodtem sac checkpoint 2", "sac.checkpoint", path,
+            ": is not a SAC checkpoint of this version; remove it to train anew");
+    const std::string found = file.text("settings"), wanted = settings_text(learner, note);
+    require(found == wanted, "sac.checkpoint", path, ": was made with ", found, ", this run has ", wanted);
     Loader loader{file};
     learner.visit(loader);
 }
@@ -552,10 +547,10 @@ inline void save_policy(const std::string& path, const Network<float>& policy,
 // The policy that save_policy() wrote. Errors: sac.policy, safetensors.*
 inline Network<float> policy_of(const TensorFile& file) {
     const Shape first = file.find("fc0.weight").shape, last = file.find("last_fc.weight").shape;
-    const auto too_large = [](uint64_t extent) { return extent < 1 || extent > 1 << 14; };
-    if (first.size() != 2 || last.size() != 2 || too_large(first[0]) || too_large(first[1]) || too_large(last[0]))
-        fail("sac.policy", "%s: fc0.weight %s and last_fc.weight %s are not those of a policy", file.path.c_str(),
-             shape_text(first).c_str(), shape_text(last).c_str());
+    const auto fits = [](uint64_t extent) { return extent >= 1 && extent <= 1 << 14; };
+    const bool tables = first.size() == 2 && last.size() == 2;
+    require(tables && fits(first[0]) && fits(first[1]) && fits(last[0]), "sac.policy", file.path, ": fc0.weight ",
+            shape_text(first), " and last_fc.weight ", shape_text(last), " are not those of a policy");
     Network<float> policy(first[1], first[0], 2 * last[0], 1, 0, 0);
     each_policy_tensor(policy.parameters, [&](const std::string& name, const Shape& shape, auto values) {
         file.read_into(values, name, shape);

@@ -80,10 +80,9 @@ inline double number_in(const std::string& text, const char* id, const char* nam
     const double least = static_cast<double>(low), most = static_cast<double>(high);
     const std::optional<double> x = to_number(text);
     const double within = std::clamp(x.value_or(least), least, most), nearest = whole ? std::round(within) : within;
-    if (x != nearest)
-        fail(id, "%s cannot be \"%s\"; it is a %snumber from %s to %s%s", name, text.c_str(), whole ? "whole " : "",
-             number_text(low).c_str(), number_text(high).c_str(),
-             x ? ("; the nearest is " + number_text(static_cast<decltype(low)>(nearest))).c_str() : "");
+    require(x == nearest, id, name, " cannot be \"", text, "\"; it is a ", whole ? "whole " : "", "number from ",
+            number_text(low), " to ", number_text(high),
+            x ? "; the nearest is " + number_text(static_cast<decltype(low)>(nearest)) : "");
     return *x;
 }
 
@@ -387,8 +386,7 @@ inline void parse_value(const SettingRow& row, const std::string& text, std::str
 }
 
 inline void parse_value(const SettingRow& row, const std::string& text, bool& value) {
-    if (text != "yes" && text != "no")
-        fail("usage.setting", "%s cannot be \"%s\"; it is yes or no", row.name, text.c_str());
+    require(text == "yes" || text == "no", "usage.setting", row.name, " cannot be \"", text, "\"; it is yes or no");
     value = text == "yes";
 }
 
@@ -435,8 +433,8 @@ inline Settings default_settings(const std::string& task, const std::string& met
         set_from(settings, "eta", std::to_string(-mujoco->action_dim), "ODT's code: minus the action dimensions");
     if (preset == "small" && gridworld) set_from(settings, "width", "8", "preset small: everything else as in Table I");
     if (preset == "small") apply(small_rows);
-    if (preset == "reduced" && gridworld)
-        fail("usage.setting", "preset reduced is for MuJoCo's tasks; the grid world has small and paper");
+    require(preset != "reduced" || !gridworld, "usage.setting",
+            "preset reduced is for MuJoCo's tasks; the grid world has small and paper");
     if (preset == "reduced") apply(reduced_rows);
     if (settings.task == own_data) set_from(settings, "online_steps", "0", "there is no environment");
     if (method == "dt") {
@@ -450,40 +448,31 @@ inline Settings default_settings(const std::string& task, const std::string& met
 }
 
 // Conditions on several settings at once. Errors: usage.setting.
-inline void check_together(const Settings& settings) {
-    const long long width = settings.width, heads = settings.heads, batch_size = settings.batch_size;
-    const long long context_length = settings.context_length, online_steps = settings.online_steps;
-    if (width % heads != 0)
-        fail("usage.setting", "width %lld is not a multiple of heads %lld; the nearest width is %lld", width, heads,
-             (width / heads + 1) * heads);
-    if (batch_size * context_length > 1000000)
-        fail("usage.setting", "batch_size %lld times context_length %lld is more than a million steps in one update",
-             batch_size, context_length);
-    if (settings.cut == "episodes" && !settings.task.starts_with("maze2d"))
-        fail("usage.setting", "cut=episodes is for maze2d, whose file is one walk without an end; %s has cut=flags",
-             settings.task.c_str());
-    if (online_steps > 0 && settings.method == "dt")
-        fail("usage.setting", "method dt learns offline only: online_steps must be 0, not %lld", online_steps);
-    const bool gridworld = settings.task == "gridworld", own = settings.task == own_data;
-    if (own && (settings.state_dim == 0 || settings.action_dim == 0 || (settings.moves > 0 && settings.action_dim > 1)))
-        fail("usage.setting", "the task data is chosen by giving a file: wodtem train FILE.hdf5");
-    const long long outputs = std::max(settings.moves, settings.action_dim);  // the head's rows are orthonormal
-    if (own && outputs > width && (settings.moves > 0 || settings.method != "dt"))
-        fail("usage.setting", "width %lld is less than the %lld moves or action numbers; give --set width=%lld or more",
-             width, outputs, divide_up(outputs, heads) * heads);
-    if (own && settings.behaviour != "recorded") fail("usage.setting", "own data have behaviour recorded");
-    if (own && online_steps > 0)
-        fail("usage.setting", "online_steps must be 0, not %lld: own data have no environment", online_steps);
-    if (!own && settings.held_out > 0)
-        fail("usage.setting", "held_out is for own data; others are evaluated by acting");
-    if (settings.clip_actions && (gridworld || settings.moves > 0))
-        fail("usage.setting", "the actions are moves, which cannot be clipped: clip_actions must be no");
-    if ((gridworld || own) != (settings.physics == "none"))
-        fail("usage.setting", "%s cannot have physics %s; it is %s", settings.task.c_str(), settings.physics.c_str(),
-             gridworld || own ? "none: there are no bodies" : "d4rl or 2.2");
-    if (gridworld == (settings.behaviour == "random" || settings.behaviour == "recorded"))
-        fail("usage.setting", "%s cannot have behaviour %s; it is %s", settings.task.c_str(),
-             settings.behaviour.c_str(), gridworld ? "right_down or left_down" : "recorded or random");
+inline void check_together(const Settings& s) {
+    const auto rule = [](bool holds, const auto&... parts) { require(holds, "usage.setting", parts...); };
+    rule(s.width % s.heads == 0, "width ", s.width, " is not a multiple of heads ", s.heads, "; the nearest width is ",
+         (s.width / s.heads + 1) * s.heads);
+    rule(s.batch_size * s.context_length <= 1000000, "batch_size ", s.batch_size, " times context_length ",
+         s.context_length, " is more than a million steps in one update");
+    rule(s.cut != "episodes" || s.task.starts_with("maze2d"),
+         "cut=episodes is for maze2d, whose file is one walk without an end; ", s.task, " has cut=flags");
+    rule(s.method != "dt" || s.online_steps == 0, "method dt learns offline only: online_steps must be 0, not ",
+         s.online_steps);
+    const bool gridworld = s.task == "gridworld", own = s.task == own_data;
+    rule(!own || (s.state_dim > 0 && s.action_dim > 0 && (s.moves == 0 || s.action_dim == 1)),
+         "the task data is chosen by giving a file: wodtem train FILE.hdf5");
+    const int64_t outputs = std::max(s.moves, s.action_dim);  // the head's rows are orthonormal
+    rule(!own || outputs <= s.width || (s.moves == 0 && s.method == "dt"), "width ", s.width, " is less than the ",
+         outputs, " moves or action numbers; give --set width=", divide_up(outputs, s.heads) * s.heads, " or more");
+    rule(!own || s.behaviour == "recorded", "own data have behaviour recorded");
+    rule(!own || s.online_steps == 0, "online_steps must be 0, not ", s.online_steps, ": own data have no environment");
+    rule(own || s.held_out == 0, "held_out is for own data; others are evaluated by acting");
+    rule(!s.clip_actions || (!gridworld && s.moves == 0),
+         "the actions are moves, which cannot be clipped: clip_actions must be no");
+    rule((gridworld || own) == (s.physics == "none"), s.task, " cannot have physics ", s.physics, "; it is ",
+         gridworld || own ? "none: there are no bodies" : "d4rl or 2.2");
+    rule(gridworld != (s.behaviour == "random" || s.behaviour == "recorded"), s.task, " cannot have behaviour ",
+         s.behaviour, "; it is ", gridworld ? "right_down or left_down" : "recorded or random");
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -559,12 +548,11 @@ inline std::vector<Setting> parse_settings(const std::string& text, const std::s
         if (hash != std::string::npos)
             setting = {trimmed(all.substr(0, equals)), trimmed(all.substr(equals + 2, hash - equals - 2)),
                        trimmed(all.substr(hash + 2))};
-        if (setting.name.empty() || setting.value.empty() || setting.source.empty())
-            fail("settings.line", "%s: line %zu: expected \"name = value    # source\", got \"%s\"", path.c_str(), line,
-                 trimmed(all).c_str());
-        if (std::any_of(out.begin(), out.end(), [&](const Setting& other) { return other.name == setting.name; }))
-            fail("settings.repeated", "%s: line %zu: \"%s\" was set before; keep one of the lines", path.c_str(), line,
-                 setting.name.c_str());
+        const bool complete = !setting.name.empty() && !setting.value.empty() && !setting.source.empty();
+        require(complete, "settings.line", path, ": line ", line, ": expected \"name = value    # source\", got \"",
+                trimmed(all), "\"");
+        require(std::ranges::find(out, setting.name, &Setting::name) == out.end(), "settings.repeated", path, ": line ",
+                line, ": \"", setting.name, "\" was set before; keep one of the lines");
         setting.value = unquoted(setting.value);
         out.push_back(setting);
     }
@@ -582,9 +570,8 @@ inline Settings settings_from_text(const std::string& text, const std::string& p
         }
     }
     for (const SettingRow& row : setting_rows)
-        if (!settings.source.contains(row.name) && !is_later(row))
-            fail("settings.missing", "%s: setting %s is missing; is it damaged, or from another version?", path.c_str(),
-                 row.name);
+        require(settings.source.contains(row.name) || is_later(row), "settings.missing", path, ": setting ", row.name,
+                " is missing; is it damaged, or from another version?");
     return settings;
 }
 
@@ -602,12 +589,11 @@ inline void require_same_settings(const Settings& found, const Settings& wanted,
     for (const SettingRow& row : setting_rows) {
         const std::string was = setting_text(found, row), now = setting_text(wanted, row);
         const bool same_data = found.dataset_sha256 == wanted.dataset_sha256;  // whatever the file is called
-        if (was == now || (row.name == std::string_view("dataset") && same_data)) continue;
-        const bool kernel = std::string(row.name) == "arithmetic";
-        fail("run.other_settings", "%s belongs to a run with %s = %s, but %s was asked for; %s", where.c_str(),
-             row.name, was.c_str(), now.c_str(),
-             kernel ? "choose the kernel it was begun with (--kernel)"
-                    : "choose another folder with --out, or the same settings");
+        const std::string_view name = row.name;
+        require(was == now || (name == "dataset" && same_data), "run.other_settings", where, " belongs to a run with ",
+                name, " = ", was, ", but ", now, " was asked for; ",
+                name == "arithmetic" ? "choose the kernel it was begun with (--kernel)"
+                                     : "choose another folder with --out, or the same settings");
     }
 }
 
