@@ -817,26 +817,6 @@ inline std::vector<Trajectory> make_data_set(const Settings& settings) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Statistics of a data set, for `wodtem info`
 
-struct Moments {
-    double count = 0, sum = 0, squares = 0, low = INFINITY, high = -INFINITY;
-    void add(double x) {
-        ++count;
-        sum += x;
-        squares += x * x;
-        low = std::min(low, x);
-        high = std::max(high, x);
-    }
-    double mean() const { return sum / count; }
-    // The divisor is n, as in D4RL's statistics.
-    double deviation() const { return std::sqrt(std::max(0.0, squares / count - mean() * mean())); }
-    std::string text() const {
-        if (count == 0) return "none";
-        char line[160];
-        std::snprintf(line, sizeof line, "mean %.2f, deviation %.2f, %.2f to %.2f", mean(), deviation(), low, high);
-        return line;
-    }
-};
-
 struct DataSetStatistics {
     Moments lengths, returns, actions;
     size_t terminated = 0;    // trajectories that the task ended

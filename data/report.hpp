@@ -20,7 +20,7 @@
 // ---------------------------------------------------------------------------------------------------------------------
 // Logs
 
-namespace results {  // the training program has names of its own: Run, Spread, ...
+namespace results {  // the training program has names of its own: Run, Log, ...
 
 constexpr double none = NAN;
 
@@ -300,28 +300,10 @@ inline Run read_run(const std::string& folder) {
 // ---------------------------------------------------------------------------------------------------------------------
 // From runs to numbers. NaN: there is none.
 
-struct Spread {
-    size_t count = 0;         // of values that are not NaN
-    double mean = none;       // of these
-    double deviation = none;  // standard deviation with count - 1
-};
-
-// NaN values do not count.
-inline Spread spread_of(std::vector<double> values) {
-    std::erase_if(values, [](double value) { return std::isnan(value); });
-    Spread out{values.size(), none, none};
-    const auto n = static_cast<double>(values.size());
-    double squares = 0;
-    if (n > 0) out.mean = std::accumulate(values.begin(), values.end(), 0.0) / n;
-    for (const double value : values) squares += (value - out.mean) * (value - out.mean);
-    if (n > 1) out.deviation = std::sqrt(squares / (n - 1));
-    return out;
-}
-
 // "5.00 ± 0.00"; "5.00 ± -" for one value; "-" for none.
-inline std::string plus_minus(const Spread& spread, int decimals = 2) {
-    if (spread.count == 0) return "-";
-    return svg::grouped(spread.mean, decimals) + " ± " + svg::grouped(spread.deviation, decimals);
+inline std::string plus_minus(const Moments& results, int decimals = 2) {
+    if (results.count == 0) return "-";
+    return svg::grouped(results.mean(), decimals) + " ± " + svg::grouped(results.sample_deviation(), decimals);
 }
 
 // The value of the last evaluation that has one.
@@ -337,13 +319,13 @@ inline double last_ten(const Run& run, const Quantity& quantity) {
     std::vector<double> values = run.column(quantity);
     std::erase_if(values, [](double value) { return std::isnan(value); });
     values.erase(values.begin(), values.end() - static_cast<int>(std::min<size_t>(values.size(), 10)));
-    return spread_of(values).mean;
+    return moments_of(values).mean();
 }
 
-inline Spread spread_of(const Runs& runs, Summary summary, const Quantity& quantity) {
+inline Moments over_seeds(const Runs& runs, Summary summary, const Quantity& quantity) {
     std::vector<double> values;
     for (const Run* run : runs) values.push_back(summary(*run, quantity));
-    return spread_of(values);
+    return moments_of(values);
 }
 
 // The interactions of the first evaluation from which on every one had this length.
@@ -399,7 +381,9 @@ struct PaperResult {
     double mean, deviation;
     const char* words = "";  // of a result that the paper does not give as mean ± deviation
 
-    std::string text() const { return *words != 0 ? words : plus_minus({5, mean, deviation}); }
+    std::string text() const {
+        return *words != 0 ? words : svg::grouped(mean, 2) + " ± " + svg::grouped(deviation, 2);
+    }
 };
 struct PaperRow {
     const char* task;  // without the version
@@ -729,12 +713,12 @@ inline long unfinished(const Runs& runs) { return std::ranges::count(runs, false
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
 inline std::string compared(const Row& row, const Quantity& quantity, const PaperResult& paper) {
-    const Spread ours = spread_of(row.runs, final_value, quantity);
-    const double difference = ours.mean - paper.mean;
+    const Moments ours = over_seeds(row.runs, final_value, quantity);
+    const double difference = ours.mean() - paper.mean;
     std::string out = row.label();
     if (unfinished(row.runs) > 0) out += " (unfinished)";
     if (ours.count == 0) out += " has no result yet";
-    if (ours.count == 1) out += " " + svg::grouped(ours.mean, 2);
+    if (ours.count == 1) out += " " + svg::grouped(ours.mean(), 2);
     if (ours.count > 1) out += " " + plus_minus(ours);
     out += ", paper " + paper.text();
     if (std::fabs(difference) <= paper.deviation) out += ", agrees";
@@ -772,7 +756,7 @@ inline Table method_table(const Group& group) {
     if (own) table.header.push_back("Final log-probability, held out");
     for (const Row& row : group.rows) {
         const auto mean = [&](Summary summary, const Quantity& quantity) {
-            return plus_minus(spread_of(row.runs, summary, quantity), group.decimals);
+            return plus_minus(over_seeds(row.runs, summary, quantity), group.decimals);
         };
         std::string seeds = std::to_string(row.runs.size());
         if (unfinished(row.runs) > 0) seeds += " (" + std::to_string(unfinished(row.runs)) + " unfinished)";
@@ -781,7 +765,7 @@ inline Table method_table(const Group& group) {
         line = {row.label(), seeds, mean(final_value, group.quantity), mean(last_ten, group.quantity)};
         if (!own) line.insert(line.end(), {paper ? paper->text() : "-", mean(final_value, "eval_return")});
         if (scores) line.push_back(mean(final_value, "eval_length"));
-        if (own) line.push_back(plus_minus(spread_of(row.runs, final_value, "held_out_log_prob")));
+        if (own) line.push_back(plus_minus(over_seeds(row.runs, final_value, "held_out_log_prob")));
     }
     return table;
 }
@@ -793,10 +777,8 @@ inline Table dose_table(const Group& group) {
                 {}};
     for (const Row& row : group.rows) {
         const auto thousandths = [&](const Quantity& quantity) {
-            Spread spread = spread_of(row.runs, last_ten, quantity);
-            spread.mean *= 1000;
-            spread.deviation *= 1000;
-            return plus_minus(spread);
+            const auto summary = [](const Run& run, const Quantity& what) { return 1000 * last_ten(run, what); };
+            return plus_minus(over_seeds(row.runs, summary, quantity));
         };
         if (row.any().settings.method == "wodtem" && !row.any().column("advice").empty())
             table.rows.push_back(
@@ -909,7 +891,7 @@ inline std::string updates_sentence(const Group& group) {
     if (group.any().own() || group.rows.size() < 2) return "";
     std::string out;
     const Row* first = nullptr;
-    const auto updates = [](const Row& row) { return spread_of(row.runs, final_value, "updates").mean; };
+    const auto updates = [](const Row& row) { return over_seeds(row.runs, final_value, "updates").mean(); };
     for (const Row& row : group.rows) {
         if (row.any().offline_only() || std::isnan(updates(row))) continue;
         out += (first ? "; " : "Updates made, mean over seeds: ") + row.label() + " " + svg::grouped(updates(row), 0);

@@ -172,17 +172,16 @@ inline void print_end(const std::string& path, const ProgressRow& row, const Set
 // the standard deviation of the returns over them.
 inline void print_evaluation(const Settings& settings, const std::vector<Episode>& episodes, double mean_length,
                              double mean_return) {
-    size_t number = 0, count = 0;
-    double squares = 0;
+    size_t number = 0;
+    Moments returns;
     for (const Episode& episode : episodes) {
         ++number;
         if (!episode.error.empty()) {
             std::fprintf(stderr, "wodtem: episode %zu is dropped: %s\n", number, episode.error.c_str());
             continue;
         }
-        count += 1;
         const double total = total_return(episode.trajectory);
-        squares += (total - mean_return) * (total - mean_return);
+        returns.add(total);
         std::printf("episode %zu: length %d, return %s", number, episode.trajectory.length(),
                     number_text(static_cast<float>(total)).c_str());
         for (const float move : episode.trajectory.actions)
@@ -190,11 +189,11 @@ inline void print_evaluation(const Settings& settings, const std::vector<Episode
         std::printf("\n");
     }
     const std::string deviation =
-        count > 1 ? " +- " + number_text(static_cast<float>(std::sqrt(squares / static_cast<double>(count - 1)))) : "";
-    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s%s over %zu episode%s (%s)\n",
+        returns.count > 1 ? " +- " + number_text(static_cast<float>(returns.sample_deviation())) : "";
+    std::printf("%s, %s, seed %lld: mean length %s, mean return %s%s%s over %.0f episode%s (%s)\n",
                 settings.task.c_str(), settings.method.c_str(), static_cast<long long>(settings.seed),
                 number_text(mean_length).c_str(), number_text(mean_return).c_str(), deviation.c_str(),
-                score_text(settings, mean_return).c_str(), count, count == 1 ? "" : "s",
+                score_text(settings, mean_return).c_str(), returns.count, returns.count == 1 ? "" : "s",
                 physics_text(settings).c_str());
 }
 

@@ -143,6 +143,39 @@ int index_of(const std::array<const char*, N>& names, const std::string& name) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// Means and deviations.
+
+// Of the numbers that were added. Mean and deviation of none are NaN, and so is the sample's deviation of one.
+struct Moments {
+    double count = 0, sum = 0, squares = 0, low = INFINITY, high = -INFINITY;  // squares: of distances from the mean
+    void add(double x) {
+        const double off = count > 0 ? x - mean() : 0;
+        ++count;
+        sum += x;
+        squares += off * (x - mean());  // Welford's update
+        low = std::min(low, x);
+        high = std::max(high, x);
+    }
+    double mean() const { return sum / count; }
+    double deviation() const { return std::sqrt(squares / count); }  // of the numbers as they are, as D4RL's statistics
+    double sample_deviation() const { return std::sqrt(squares / (count - 1)); }
+    std::string text() const {
+        if (count == 0) return "none";
+        char line[160];
+        std::snprintf(line, sizeof line, "mean %.2f, deviation %.2f, %.2f to %.2f", mean(), deviation(), low, high);
+        return line;
+    }
+};
+
+// Of those values that are not NaN.
+inline Moments moments_of(const std::vector<double>& values) {
+    Moments moments;
+    for (const double value : values)
+        if (!std::isnan(value)) moments.add(value);
+    return moments;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
 // The tables.
 
 struct OwnData;  // d4rl.hpp

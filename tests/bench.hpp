@@ -604,15 +604,6 @@ void bench_learner(const Kernel& kernel, int threads) {
                 settings.batch, threads, 200 / seconds.median, 200 / seconds.high, 200 / seconds.low);
 }
 
-// Mean and standard error over episodes.
-std::pair<double, double> mean_and_error(const std::vector<double>& values) {
-    double sum = 0, squares = 0;
-    for (const double x : values) sum += x;
-    const double n = static_cast<double>(values.size()), mean = sum / n;
-    for (const double x : values) squares += (x - mean) * (x - mean);
-    return {mean, std::sqrt(squares / (n - 1) / n)};
-}
-
 struct RandomPolicy {
     std::vector<double> lengths, returns;  // of each episode
 };
@@ -653,11 +644,11 @@ void bench_random_policy(int threads) {
             const MujocoTask& task = *find_mujoco_task(row.task);
             if (task.rules == Rules::maze2d && physics == Physics::mujoco_2_2) continue;  // a ball is a ball
             const RandomPolicy result = play_randomly(task, physics, row.episodes, threads);
-            const auto [length, length_error] = mean_and_error(result.lengths);
-            const auto [total, total_error] = mean_and_error(result.returns);
+            const Moments length = moments_of(result.lengths), total = moments_of(result.returns);
+            const double root = std::sqrt(length.count);  // of a standard error
             std::printf("  %-14s %-4s %6d episodes  length %8.3f +- %.3f (published %.3f)  return %8.3f +- %.3f (%s)\n",
-                        task.name, physics_names[static_cast<size_t>(physics)], row.episodes, length, length_error,
-                        row.length, total, total_error,
+                        task.name, physics_names[static_cast<size_t>(physics)], row.episodes, length.mean(),
+                        length.sample_deviation() / root, row.length, total.mean(), total.sample_deviation() / root,
                         std::isnan(row.total) ? "not published" : ("published " + number_text(row.total)).c_str());
         }
 }

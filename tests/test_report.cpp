@@ -161,13 +161,13 @@ TEST(settings_lines_of_another_form_are_refused) {
 }
 
 TEST(spread_divides_by_one_less_than_the_count_and_passes_over_missing_values) {
-    const Spread got = spread_of({2, none, 4, 4, 4, 5, 5, 7, 9});  // mean 5, squares 9 1 1 1 0 0 4 16: 32 / 7
-    CHECK_EQUAL(got.count, size_t{8});
-    CHECK_CLOSE(got.mean, 5, 0);
-    CHECK_CLOSE(got.deviation, 2.138089935299395, 1e-15);
-    CHECK_EQUAL(plus_minus(spread_of({5, 5})), "5.00 ± 0.00");
-    CHECK_EQUAL(plus_minus(spread_of({5})), "5.00 ± -");
-    CHECK_EQUAL(plus_minus(spread_of({none})), "-");
+    const Moments got = moments_of({2, none, 4, 4, 4, 5, 5, 7, 9});  // mean 5, squares 9 1 1 1 0 0 4 16: 32 / 7
+    CHECK_EQUAL(got.count, 8.0);
+    CHECK_CLOSE(got.mean(), 5, 0);
+    CHECK_CLOSE(got.sample_deviation(), 2.138089935299395, 1e-15);
+    CHECK_EQUAL(plus_minus(moments_of({5, 5})), "5.00 ± 0.00");
+    CHECK_EQUAL(plus_minus(moments_of({5})), "5.00 ± -");
+    CHECK_EQUAL(plus_minus(moments_of({none})), "-");
 }
 
 TEST(mean_of_last_ten_passes_over_missing_values) {
@@ -1017,9 +1017,6 @@ std::string row_of(const std::string& page, const std::string& first_cells) {
     return at == std::string::npos ? "" : page.substr(at + 1, page.find('\n', at + 1) - at - 1);
 }
 
-std::string one_decimal(const Spread& spread) {
-    return svg::grouped(spread.mean, 1) + " ± " + svg::grouped(spread.deviation, 1);
-}
 }  // namespace
 
 // Each archive holds run folders; the figures that the page shows of them, and its numbers, are those of the program.
@@ -1052,7 +1049,7 @@ TEST(stored_runs_redraw_the_figures_and_give_the_numbers_of_the_results_page) {
         for (const Run& run : runs) pointers.push_back(&run);
         const std::string row = row_of(page, std::string("large | ") + label + " | 0 to 12");
         for (const Summary summary : {last_ten, final_value}) {
-            const std::string number = one_decimal(spread_of(pointers, summary, "eval_score"));
+            const std::string number = plus_minus(over_seeds(pointers, summary, "eval_score"), 1);
             if (row.find("| " + number + " |") == std::string::npos)
                 report_failure(__FILE__, __LINE__, number + " is not in: " + row);
         }
