@@ -823,27 +823,10 @@ struct DataSetStatistics {
     size_t left_out = 0;      // rows in no trajectory
     size_t dead_columns = 0;  // of the state: always the same number
     size_t repeated = 0;      // rows whose observation is that of the row before
-    size_t duplicates = 0;    // rows whose observation, action and reward are those of an earlier row, anywhere
     size_t not_finite = 0;    // numbers, of any kind
     size_t jumps = 0;         // rows within a trajectory whose next observation is not the next row's
     bool has_next = false;
 };
-
-// Counts the rows that are equal to an earlier one, by 64-bit hashes of their bytes.
-inline size_t count_duplicates(const Rows& rows) {
-    const auto bytes = [](const std::vector<float>& values, size_t row, size_t width) {
-        return std::string_view(reinterpret_cast<const char*>(&values[row * width]), width * sizeof(float));
-    };
-    std::vector<uint64_t> hashes(rows.count);
-    for (size_t i = 0; i < rows.count; ++i) {
-        std::string row(bytes(rows.observations, i, rows.state_dim));
-        row += bytes(rows.actions, i, rows.action_dim);
-        row += bytes(rows.rewards, i, 1);
-        hashes[i] = std::hash<std::string>{}(row);
-    }
-    std::ranges::sort(hashes);
-    return static_cast<size_t>(std::ranges::unique(hashes).size());
-}
 
 inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Trajectory>& trajectories) {
     DataSetStatistics s;
@@ -865,7 +848,6 @@ inline DataSetStatistics statistics_of(const Rows& rows, const std::vector<Traje
     }
     for (const auto* values : {&rows.observations, &rows.actions, &rows.rewards, &rows.next_observations})
         s.not_finite += static_cast<size_t>(std::ranges::count_if(*values, [](float x) { return !std::isfinite(x); }));
-    s.duplicates = count_duplicates(rows);
     s.has_next = !rows.next_observations.empty();
     for (size_t row = 0; row + 1 < rows.count; ++row) {
         const float *here = rows.observation(row), *next = rows.observation(row + 1);
@@ -882,9 +864,9 @@ inline std::string describe(const DataSetStatistics& s) {
                   "trajectories: %.0f (%zu ended by the task), %zu rows in none\n"
                   "lengths:      %s\nreturns:      %s\nactions:      %.9g to %.9g\n"
                   "state columns that never change: %zu\nrows that repeat the observation before: %zu\n"
-                  "rows that are equal to an earlier one: %zu\nnumbers that are not finite: %zu\n",
+                  "numbers that are not finite: %zu\n",
                   s.lengths.count, s.terminated, s.left_out, s.lengths.text().c_str(), s.returns.text().c_str(),
-                  s.actions.low, s.actions.high, s.dead_columns, s.repeated, s.duplicates, s.not_finite);
+                  s.actions.low, s.actions.high, s.dead_columns, s.repeated, s.not_finite);
     return lines + (s.has_next ? "next observations that are not the next row's: " + std::to_string(s.jumps) + "\n"
                                : "no next observations: the next row's stand in\n");
 }
