@@ -46,8 +46,8 @@ inline sac::Network<float> embedded_policy(const std::string& name) {
         {"halfcheetah-medium", {wodtem_halfcheetah_medium, wodtem_halfcheetah_medium_end}},
         {"ant-medium", {wodtem_ant_medium, wodtem_ant_medium_end}},
         {walker_name, {wodtem_antmaze_walker, wodtem_antmaze_walker_end}}};
-    if (!embedded.contains(name))
-        fail("collect.policy", "this version holds no policy %s; give one with --policy FILE", name.c_str());
+    require(embedded.contains(name), "collect.policy", "this version holds no policy ", name,
+            "; give one with --policy FILE");
     const auto [begin, end] = embedded.at(name);
     return sac::policy_of(parse_safetensors(std::string(begin, end), "the policy " + name));
 }
