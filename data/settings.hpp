@@ -9,6 +9,7 @@
 //
 // Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
 // an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
+// In order: text, means and deviations, which all of data/ uses; the tables; settings by name, as text, as parts.
 // The other headers of data/ that include this one have what it includes.
 #pragma once
 
