@@ -429,8 +429,8 @@ struct TensorFile {
         return out;
     }
 
-    // Returns a tensor's numbers, whatever their type in the file. A double holds all but large whole numbers exactly, a
-    // long double every one.
+    // Returns a tensor's numbers, whatever their type in the file. A double holds all but large whole numbers exactly,
+    // a long double every one.
     template <class Number = double>
     std::vector<Number> numbers(const StoredTensor& tensor) const {
         const std::string_view from = bytes(tensor);
