@@ -804,7 +804,6 @@ struct Watcher {
 // Trains in a folder of its own, which may hold a part of this very run: claims the folder, begins or continues the
 // run, goes through its phases, and saves the model. Errors: run.*, nn.not_finite, file.*, and those of the data set.
 void train(const Settings& settings, const std::string& path, const TrainOptions& options) {
-    make_folder(path, "run.folder");
     const FolderLock lock(path);
     RunFolder folder{path};
     claim_folder(folder, settings);

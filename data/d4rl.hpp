@@ -92,13 +92,16 @@ inline std::string file_name(const PublishedDataSet& set) { return std::filesyst
 constexpr const char* own_folder = "runs/datasets";
 
 // Returns the file of a data set: `given` itself, or that of the numbers in a folder of Minari's.
-// Errors: dataset.arrow for Minari's other form.
+// Errors: dataset.arrow for Minari's other form, dataset.folder for any other folder.
 inline std::string data_set_file(const std::string& given) {
     for (const char* file : {"/data/main_data.hdf5", "/main_data.hdf5"})
         if (is_there(given + file)) return given + file;
     for (const char* file : {"/data/0/part-0.arrow", "/0/part-0.arrow", "/part-0.arrow", ""})
         require(!(given + file).ends_with(".arrow") || !is_there(given + file), "dataset.arrow", given,
                 ": is Minari's Arrow form, which is not read here; write it with data_format='hdf5'");
+    std::error_code none;
+    require(!std::filesystem::is_directory(given, none), "dataset.folder", given,
+            ": is a folder without Minari's data/main_data.hdf5; give the folder of one data set, or a file");
     return given;
 }
 
@@ -625,28 +628,29 @@ inline size_t rows_in_none(const Rows& rows, const std::vector<Trajectory>& traj
     return left;
 }
 
-// Returns a sentence on the first column whose normalised numbers would be nearly one number, but for a few far off:
-// 98% of some 10,000 of its numbers lie within a hundredth of its deviation. "": there is none, or few rows.
+// Returns a sentence on the first column of observations, or the rewards, whose numbers are nearly one number beside a
+// few far off: 98% of some 10,000 of them lie within a hundredth of their deviation. "": there is none, or few rows.
 inline std::string remark_on_outliers(const Rows& rows) {
-    const size_t width = rows.state_dim, stride = rows.count / 10000 + 1;
-    std::vector<double> sums(width), squares(width), sample;
+    const size_t stride = rows.count / 10000 + 1;
     const double n = static_cast<double>(rows.count);
-    for (size_t row = 0; row < rows.count; ++row)
-        for (size_t column = 0; column < width; ++column) sums[column] += rows.observation(row)[column];
-    for (size_t row = 0; row < rows.count; ++row)
-        for (size_t column = 0; column < width; ++column)
-            squares[column] += std::pow(rows.observation(row)[column] - sums[column] / n, 2);
-    for (size_t column = 0; column < width && rows.count >= 200; ++column) {
+    std::vector<double> sample;
+    for (size_t column = 0; column <= static_cast<size_t>(rows.state_dim) && rows.count >= 200; ++column) {
+        const bool reward = column == static_cast<size_t>(rows.state_dim);
+        const auto value = [&](size_t row) { return reward ? rows.rewards[row] : rows.observation(row)[column]; };
+        double sum = 0, squares = 0;
+        for (size_t row = 0; row < rows.count; ++row) sum += value(row);
+        for (size_t row = 0; row < rows.count; ++row) squares += std::pow(value(row) - sum / n, 2);
         sample.clear();
-        for (size_t row = 0; row < rows.count; row += stride) sample.push_back(rows.observation(row)[column]);
+        for (size_t row = 0; row < rows.count; row += stride) sample.push_back(value(row));
         std::ranges::sort(sample);
         const double low = sample[sample.size() / 100], high = sample[sample.size() - 1 - sample.size() / 100];
-        if (!(low < high && high - low < 0.01 * std::sqrt(squares[column] / n))) continue;
-        size_t row = 0;
-        for (size_t i = 1; i < rows.count; ++i)
-            if (std::fabs(rows.observation(i)[column] - low) > std::fabs(rows.observation(row)[column] - low)) row = i;
-        return text_of("\"observations\", row ", row, ", column ", column, " is ", rows.observation(row)[column],
-                       ", so far from most others that these are nearly one number once normalised: is it an error?");
+        if (!(low < high && high - low < 0.01 * std::sqrt(squares / n))) continue;
+        size_t far = 0;
+        for (size_t row = 1; row < rows.count; ++row)
+            if (std::fabs(value(row) - low) > std::fabs(value(far) - low)) far = row;
+        return text_of(reward ? "\"rewards\", row " : "\"observations\", row ", far,
+                       reward ? "" : text_of(", column ", column), " is ", value(far),
+                       ", so far from most others that these are nearly one number beside it: is it an error?");
     }
     return "";
 }

@@ -712,29 +712,31 @@ inline Figure maze_map(const Group& group, const Row& row, const Run& run) {
 inline long unfinished(const Runs& runs) { return std::ranges::count(runs, false, &Run::finished); }
 
 // "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
-inline std::string compared(const Row& row, const Quantity& quantity, const PaperResult& paper) {
-    const Moments ours = over_seeds(row.runs, final_value, quantity);
-    const double difference = ours.mean() - paper.mean;
+inline std::string compared(const Row& row, const Group& group) {
+    const Moments ours = over_seeds(row.runs, final_value, group.quantity);
     std::string out = row.label();
     if (unfinished(row.runs) > 0) out += " (unfinished)";
     if (ours.count == 0) out += " has no result yet";
-    if (ours.count == 1) out += " " + svg::grouped(ours.mean(), 2);
-    if (ours.count > 1) out += " " + plus_minus(ours);
-    out += ", paper " + paper.text();
-    if (std::fabs(difference) <= paper.deviation) out += ", agrees";
-    if (difference > paper.deviation) out += ", ours is higher";
-    if (-difference > paper.deviation) out += ", ours is lower";
+    if (ours.count == 1) out += " " + svg::grouped(ours.mean(), group.decimals);
+    if (ours.count > 1) out += " " + plus_minus(ours, group.decimals);
+    const auto paper = paper_result(row.any());
+    if (!paper) return out;
+    const double difference = ours.mean() - paper->mean;
+    out += ", paper " + paper->text();
+    if (std::fabs(difference) <= paper->deviation) out += ", agrees";
+    if (difference > paper->deviation) out += ", ours is higher";
+    if (-difference > paper->deviation) out += ", ours is lower";
     return out;
 }
 
-// Compares each row with the paper in one sentence, WODTEM first; "" where the paper has no result. The sentence
-// ends with what else differs from the paper's experiment: the number of interactions, and the data set.
+// Compares each row with the paper in one sentence, WODTEM first. The sentence ends with what else differs from the
+// paper's experiment, the number of interactions and the data set, or says that the paper has no result.
 inline std::string verdict(const Group& group) {
     const Run& any = group.any();
-    if (!paper_result(any)) return "";
     std::string out = group.heading() + ", final " + group.unit + ": ";
     for (const Row& row : std::views::reverse(group.rows))
-        out += compared(row, group.quantity, *paper_result(row.any())) + (&row == &group.rows[0] ? "" : "; ");
+        out += compared(row, group) + (&row == &group.rows[0] ? "" : "; ");
+    if (!paper_result(any)) return out + "; the paper has no result on these data.";
     if (const double far = std::ranges::max(group.runs, {}, &Run::so_far)->so_far; far > 0)
         out +=
             "; online interactions: up to " + svg::grouped(far, 0) + ", paper " + (any.mujoco ? "200,000" : "20,000");
@@ -911,10 +913,9 @@ inline std::string section_name(const Run& run) {
 }
 
 // The section of runs of one task, preset and physics, sorted as Group says. Errors: report.same_seed.
-inline Section make_section(const Runs& runs, const std::string& out_folder) {
+inline Section make_section(const std::string& name, const Runs& runs, const std::string& out_folder) {
     const Settings& settings = runs.at(0)->settings;
     const bool mujoco = runs[0]->mujoco != nullptr, own = runs[0]->own();
-    const std::string name = section_name(*runs[0]);
     Group group{runs,
                 name,
                 "preset " + settings.preset + (mujoco ? ", physics " + settings.physics : ""),
@@ -958,7 +959,13 @@ inline Section make_section(const Runs& runs, const std::string& out_folder) {
 // The introduction, and a section for each group of runs.
 inline std::vector<Section> make_sections(const std::vector<Run>& runs, const std::string& out_folder) {
     std::map<std::array<std::string, 3>, Runs> groups;
-    for (const Run& run : runs) groups[{section_name(run), run.settings.preset, run.settings.physics}].push_back(&run);
+    std::map<std::string, std::string> names;  // of own data, by their checksum: the same data may have several names
+    for (const Run& run : runs) {
+        const std::string name = section_name(run);
+        const std::string& first =
+            run.own() ? names.try_emplace(run.settings.dataset_sha256, name).first->second : name;
+        groups[{first, run.settings.preset, run.settings.physics}].push_back(&run);
+    }
     const char* const numbers =
         "One section for each task, preset and physics. Runs with equal settings but for the seed are averaged; "
         "others stand apart, and a label in parentheses names the settings that differ from the preset and from other "
@@ -974,7 +981,7 @@ inline std::vector<Section> make_sections(const std::vector<Run>& runs, const st
         "DT has no online phase: its evaluation is a dashed line across. Bars: mean over seeds; strokes: from the "
         "lowest to the highest seed. A run's file settings has the value of every setting and where it came from.";
     std::vector<Section> sections{{"How to read this", {numbers, figures}}};
-    for (const auto& group : groups) sections.push_back(make_section(group.second, out_folder));
+    for (const auto& group : groups) sections.push_back(make_section(group.first[0], group.second, out_folder));
     return sections;
 }
 

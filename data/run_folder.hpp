@@ -318,11 +318,12 @@ struct RunFolder {
     }
 };
 
-// Errors: `id`.
-inline void make_folder(const std::string& path, const char* id) {
+// Returns whether the folder was not there. Errors: `id`.
+inline bool make_folder(const std::string& path, const char* id) {
     std::error_code problem;
-    std::filesystem::create_directories(path, problem);
+    const bool made = std::filesystem::create_directories(path, problem);
     require(!problem, id, "cannot make the folder ", path, ": ", problem.message());
+    return made;
 }
 
 // Errors: run.folder.
@@ -339,16 +340,24 @@ inline void remove_file(const std::string& path) {
     require(!problem, "run.folder", "cannot remove ", path, ": ", problem.message());
 }
 
-// Keeps other processes out of a folder for as long as it lives; the system releases it however the process ends.
+// Makes a folder, if it is not there, and keeps other processes out of it for as long as this lives; the system releases
+// the lock however the process ends. A folder that it made and that stayed empty, after a refused start, goes again.
 // Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
 struct FolderLock : File {
-    explicit FolderLock(const std::string& name)
-        : File(name, O_RDONLY | O_DIRECTORY, "run.folder", "open the run folder") {
+    bool made;
+
+    explicit FolderLock(const std::string& name) : FolderLock(name, make_folder(name, "run.folder")) {}
+    FolderLock(const std::string& name, bool is_new)
+        : File(name, O_RDONLY | O_DIRECTORY, "run.folder", "open the run folder"),
+          made(is_new) {
         if (::flock(fd, LOCK_EX | LOCK_NB) == 0) return;
         require(errno != EWOULDBLOCK, "run.busy", "another process is training in ", path,
                 "; wait for it, or choose another folder with --out");
         std::fprintf(stderr, "wodtem: %s cannot be locked (%s); make sure that no other process works in it\n",
                      path.c_str(), std::strerror(errno));
+    }
+    ~FolderLock() {
+        if (made) ::rmdir(path.c_str());  // which leaves what holds a file
     }
 };
 

@@ -305,7 +305,7 @@ TEST(a_folder_of_minari_stands_for_its_file) {
     const MadeFile made_file;
     const std::string folder = made_file.folder + "/set";
     std::filesystem::create_directories(folder + "/data");
-    CHECK_EQUAL(data_set_file(folder), folder);
+    CHECK_FAILS("dataset.folder", data_set_file(folder));
     CHECK_EQUAL(data_set_file(folder + "/gone"), folder + "/gone");
     write_file_atomic(folder + "/data/main_data.hdf5", "x");
     CHECK_EQUAL(data_set_file(folder), folder + "/data/main_data.hdf5");
@@ -534,9 +534,9 @@ TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
                 "dataset.not_finite f: \"actions\", row 0, column 0 is nan; only finite numbers can be learned from");
 }
 
-TEST(an_observation_that_would_drown_all_others_is_named) {
+TEST(an_observation_or_a_reward_that_would_drown_all_others_is_named) {
     Rows rows;
-    rows.count = 2000, rows.state_dim = 2;
+    rows.count = 2000, rows.state_dim = 2, rows.rewards.assign(2000, 0);
     for (size_t i = 0; i < 4000; ++i) rows.observations.push_back(static_cast<float>(i * 7 % 13));
     CHECK_EQUAL(remark_on_outliers(rows), "");
     rows.observations[2 * 1500 + 1] = 600000;  // the others lie in a thousandth of the deviation, 13400
@@ -547,6 +547,12 @@ TEST(an_observation_that_would_drown_all_others_is_named) {
     CHECK(remark_on_outliers(rows).starts_with("\"observations\", row 7, column 0 is -1e+38, so far from most"));
     for (size_t row = 0; row < 2000; ++row) rows.observations[2 * row] = 3;  // a dead column has none
     CHECK_EQUAL(remark_on_outliers(rows), "");
+    rows.rewards[9] = 1;  // rewards that are nearly always 0 are common
+    CHECK_EQUAL(remark_on_outliers(rows), "");
+    for (size_t row = 0; row < 2000; ++row) rows.rewards[row] = static_cast<float>(row % 5);
+    CHECK_EQUAL(remark_on_outliers(rows), "");
+    rows.rewards[11] = 1e38f;
+    CHECK(remark_on_outliers(rows).starts_with("\"rewards\", row 11 is 1e+38, so far from most"));
 }
 
 TEST(rows_of_another_size_or_without_an_end_are_refused) {
