@@ -1252,7 +1252,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
         });
     });
     tape.on_backward(y, [=, &compute] {
-        const Store store = next_store(x);
+        const bool set = next_store(x) == Store::overwrite;
         const T* const d_out = y.grad();
         T* const d_in = x.grad();
         // A block's sums [4, d]: d_weight, d_bias, and room for a row's g and n beside them in the cache.
@@ -1260,6 +1260,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
             const T *in = x.value + row * d, *dy = d_out + row * d;
             T *dx = d_in + row * d, *g = sum + 2 * d, *n = sum + 3 * d;
             const T mean = means[row], scale = scales[row];
+#pragma GCC ivdep  // too many arrays for the compiler to check: x, dy, the weight and the sums do not overlap
             for (int j = 0; j < d; ++j) {
                 n[j] = (in[j] - mean) * scale;
                 g[j] = dy[j] * weight.value[j];
@@ -1267,8 +1268,7 @@ Tensor<T> layer_norm(Tape<T>& tape, Tensor<T> x, const Norm<T>& norm) {
                 sum[d + j] += dy[j];
             }
             const T mean_g = dot<lanes>(g, ones, d) / T(d), mean_gn = dot<lanes>(g, n, d) / T(d);
-            if (store == Store::overwrite) std::fill_n(dx, d, T(0));
-            for (int j = 0; j < d; ++j) dx[j] += (g[j] - mean_g - n[j] * mean_gn) * scale;
+            for (int j = 0; j < d; ++j) dx[j] = (set ? T(0) : dx[j]) + (g[j] - mean_g - n[j] * mean_gn) * scale;
         });
         add_column_sums(compute, weight.grad(), sums, divide_up(x.rows, rows_a_sum), d, 4 * d);
         add_column_sums(compute, bias.grad(), sums + d, divide_up(x.rows, rows_a_sum), d, 4 * d);
