@@ -2150,14 +2150,23 @@ double block_of_squares(const T* x, size_t n) {
     return sum;
 }
 
-// f(block, first, count) for each block of [0, n), on all threads: its number, its first element and how many it has.
-// `work`: about how many operations a block.
+// The sum, block by block, of f(first, count) over the blocks of [0, n), which all threads share: a block's first
+// element and how many it has. `work`: about how many operations a block.
 template <class F>
-void for_blocks(Compute& compute, size_t n, int work, F&& f) {
-    for_rows(compute, static_cast<int>(divide_up(n, update_block)), work, [&](int begin, int end, int) {
+double sum_of_blocks(Compute& compute, size_t n, int work, F&& f) {
+    std::vector<double> sums(divide_up(n, update_block));
+    for_rows(compute, static_cast<int>(sums.size()), work, [&](int begin, int end, int) {
         for (size_t b = begin; b < static_cast<size_t>(end); ++b)
-            f(b, b * update_block, std::min(n - b * update_block, update_block));
+            sums[b] = f(b * update_block, std::min(n - b * update_block, update_block));
     });
+    return std::accumulate(sums.begin(), sums.end(), 0.0);
+}
+
+// The sum of squares of all of x.
+template <class T>
+double sum_of_squares(Compute& compute, const std::vector<T>& x) {
+    return sum_of_blocks(compute, x.size(), update_block,
+                         [&](size_t first, size_t count) { return block_of_squares(&x[first], count); });
 }
 
 // x^n by squaring: libm's pow in double differs between processors.
@@ -2168,57 +2177,64 @@ inline double power(double x, uint64_t n) {
     return result;
 }
 
+// value = shrink value - rate u. Returns whether the result is infinite or NaN: not itself less itself.
+ALWAYS_INLINE bool move_weight(float& value, float u, float shrink, float rate) {
+    const float moved = shrink * value - rate * u;
+    value = moved;
+    return !(moved - moved == 0);
+}
+
 // m, v and the step u (before the learning rate) of n weights, from the clipped gradient.
 //   m = beta1 m + (1 - beta1) g;  v = beta2 v + (1 - beta2) g^2
 //   u = (m / (1 - beta1^t)) / (sqrt(v) / sqrt(1 - beta2^t) + epsilon), in LAMB + weight decay times value
-// Written over the gradient, which is not needed any more.
-inline void adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v,
-                      const float* __restrict value, size_t n, const OptimizerConfig& config, double scale,
-                      double bias1, double bias2) {
+// At_once: the step is made, the gradient is emptied, and what comes back is whether a value is not finite. Else u is
+// written over the gradient, for apply_step().
+template <bool At_once>
+bool adam_step(float* __restrict gradient, float* __restrict m, float* __restrict v, float* __restrict value, size_t n,
+               const OptimizerConfig& config, double scale, double bias1, double bias2, float shrink, float rate) {
     const float beta1 = static_cast<float>(config.beta1), beta2 = static_cast<float>(config.beta2);
     const float one_minus_1 = static_cast<float>(1 - config.beta1), one_minus_2 = static_cast<float>(1 - config.beta2);
     const float clip = static_cast<float>(scale), root_bias2 = static_cast<float>(std::sqrt(bias2));
     const float inverse_bias1 = static_cast<float>(1 / bias1), epsilon = static_cast<float>(config.epsilon);
     const float decay = config.rule == OptimizerConfig::Rule::lamb ? static_cast<float>(config.weight_decay) : 0.0f;
     const bool unbiased = root_bias2 == 1.0f;  // from update 16,628 on if beta2 is 0.999: one slow division less
-    vectorised<float>([=](auto) INLINE_LAMBDA {
+    int bad = 0;
+    vectorised<float>([=, &bad](auto) INLINE_LAMBDA {
+        int any = 0;
         for (size_t i = 0; i < n; ++i) {
             const float g = gradient[i] * clip;
             m[i] = beta1 * m[i] + one_minus_1 * g;
             v[i] = beta2 * v[i] + one_minus_2 * g * g;
             const float root = unbiased ? std::sqrt(v[i]) : std::sqrt(v[i]) / root_bias2;
-            gradient[i] = m[i] * inverse_bias1 / (root + epsilon) + decay * value[i];
+            const float u = m[i] * inverse_bias1 / (root + epsilon) + decay * value[i];
+            if (At_once) any |= move_weight(value[i], u, shrink, rate);
+            gradient[i] = At_once ? 0.0f : u;
         }
+        bad = any;
     });
+    return bad != 0;
 }
 
-// value = shrink value - rate u, u in `gradient`, which is emptied. Returns whether all values are finite.
+// Makes the steps u in `gradient`, which is emptied. Returns whether a value is not finite.
 inline bool apply_step(float* __restrict value, float* __restrict gradient, size_t n, float shrink, float rate) {
     int bad = 0;
     vectorised<float>([=, &bad](auto) INLINE_LAMBDA {
         int any = 0;
         for (size_t i = 0; i < n; ++i) {
-            value[i] = shrink * value[i] - rate * gradient[i];
+            any |= move_weight(value[i], gradient[i], shrink, rate);
             gradient[i] = 0;
-            any |= !(value[i] - value[i] == 0);  // infinity and NaN are not themselves less themselves
         }
         bad = any;
     });
-    return bad == 0;
+    return bad != 0;
 }
 
 // The norm of the gradient over all parameters. Errors: nn.not_finite names the tensor.
 template <class T>
 double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& parameters) {
     double total = 0;
-    std::vector<double> sums;
     for (const Parameter<T>& parameter : parameters) {
-        const size_t n = parameter.gradient.size();
-        sums.assign(divide_up(n, update_block), 0);
-        for_blocks(compute, n, update_block, [&](size_t block, size_t first, size_t count) {
-            sums[block] = block_of_squares(parameter.gradient.data() + first, count);
-        });
-        const double squares = std::accumulate(sums.begin(), sums.end(), 0.0);
+        const double squares = sum_of_squares(compute, parameter.gradient);
         if (!std::isfinite(squares)) fail("nn.not_finite", "the gradient of %s is not finite", parameter.name.c_str());
         total += squares;
     }
@@ -2226,8 +2242,8 @@ double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& paramete
 }
 
 // One update of all parameters from their gradients; returns the gradient's norm before clipping. Gradients are 0 after
-// it. LAMB goes over a tensor twice, because the norm of the whole step decides how far each weight goes: moments and
-// step first, the step written over the gradient, then the weights. AdamW and Adam do both for a block at a time.
+// it. A trust ratio takes a second pass over a tensor, because the norm of the whole step decides how far each weight
+// goes: moments and step first, the step written over the gradient, then the weights.
 // LAMB as ODT has it: the trust ratio |theta| / |u| of each tensor (Q, K, V are one) has no bound, is 1 where either
 // norm is 0, and is left out at weight decay 0 unless always_adapt. Errors: nn.not_finite names the tensor, before
 // anything is changed (gradient), or after (value).
@@ -2250,29 +2266,23 @@ inline double update_parameters(Compute& compute, std::vector<Parameter<float>>&
         const size_t n = parameter.value.size();
         m.resize(n);
         v.resize(n);
-        const size_t blocks = divide_up(n, update_block);
-        std::vector<double> value_squares(blocks), step_squares(blocks);
-        std::vector<unsigned char> bad(blocks);
-        double trust = 1;
-        const auto apply = [&](size_t block, size_t first, size_t count) {
-            bad[block] = !apply_step(parameter.value.data() + first, parameter.gradient.data() + first, count, shrink,
-                                     static_cast<float>(learning_rate * trust));
-        };
-        for_blocks(compute, n, 16 * update_block, [&](size_t block, size_t first, size_t count) {
-            float *step = parameter.gradient.data() + first, *value = parameter.value.data() + first;
-            adam_step(step, m.data() + first, v.data() + first, value, count, config, scale, bias1, bias2);
-            if (!adapt) return apply(block, first, count);
-            value_squares[block] = block_of_squares(value, count);
-            step_squares[block] = block_of_squares(step, count);
+        float *const gradient = parameter.gradient.data(), *const value = parameter.value.data();
+        double bad = sum_of_blocks(compute, n, 16 * update_block, [&](size_t first, size_t count) {
+            const auto step = adapt ? adam_step<false> : adam_step<true>;
+            return step(gradient + first, m.data() + first, v.data() + first, value + first, count, config, scale,
+                        bias1, bias2, shrink, static_cast<float>(learning_rate));
         });
         if (adapt) {
-            const double value_norm = std::sqrt(std::accumulate(value_squares.begin(), value_squares.end(), 0.0));
-            const double step_norm = std::sqrt(std::accumulate(step_squares.begin(), step_squares.end(), 0.0));
+            const double value_norm = std::sqrt(sum_of_squares(compute, parameter.value));
+            const double step_norm = std::sqrt(sum_of_squares(compute, parameter.gradient));
+            double trust = 1;
             if (value_norm > 0 && step_norm > 0) trust = value_norm / step_norm;
-            for_blocks(compute, n, 4 * update_block, apply);
+            const float rate = static_cast<float>(learning_rate * trust);
+            bad = sum_of_blocks(compute, n, 4 * update_block, [&](size_t first, size_t count) {
+                return apply_step(value + first, gradient + first, count, shrink, rate);
+            });
         }
-        if (std::count(bad.begin(), bad.end(), 1) > 0)
-            fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
+        if (bad > 0) fail("nn.not_finite", "parameter %s is not finite after the update", parameter.name.c_str());
     }
     return norm;
 }
