@@ -818,7 +818,7 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     const bool serial = static_cast<double>(M) * N * K < 5e4;  // below that, sharing out costs more than it saves
     // C in tiles, tiles in blocks: of rows, and for a wide C with few rows also of columns, as equal as tiles allow.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
-    const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), 4);
+    const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), serial ? 1 : 4);
     const int row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
     const int column_blocks = std::clamp(std::max(8, 4 * threads) / row_blocks, 1, std::max(1, panels / 4));
 
@@ -1084,9 +1084,9 @@ T* gradient_of(Tensor<T> x) {
 // operations a row. Little work in all is done by the calling thread.
 template <class F>
 void for_rows(Compute& compute, int rows, int work, F&& f) {
-    const int pieces = std::max(8, compute.threads.count());
-    const int block = std::max(1, std::min(divide_up(rows, pieces), 1 + 100000 / std::max(1, work)));
     const bool serial = static_cast<double>(rows) * work < 2e4;
+    const int pieces = serial ? 1 : std::max(8, compute.threads.count());
+    const int block = std::max(1, std::min(divide_up(rows, pieces), 1 + 100000 / std::max(1, work)));
     const auto share = [&](int task, int worker) { f(task * block, std::min(rows, (task + 1) * block), worker); };
     compute.threads.run(divide_up(rows, block), share, serial);
 }
