@@ -276,17 +276,23 @@ struct ReplayBuffer {
         if (sampling == Sampling::by_length)
             return window_at(random.below(ends.back(), update, window_index), context_length);
         const size_t drawn = random.below(trajectories.size(), update, window_index);
-        const uint64_t length = trajectories[drawn].rewards.size(), first = ends[drawn] - length;
-        return window_at(first + random.below(length, update, window_index, 1), context_length);
+        const uint64_t first = steps_before(drawn), length = ends[drawn] - first;
+        return window_in(drawn, first + random.below(length, update, window_index, 1), context_length);
     }
 
     // The window that starts at a step, 0 <= step < ends.back(), of all trajectories laid end to end.
     Window window_at(uint64_t step, int context_length) const {
         const auto end = std::upper_bound(ends.begin(), ends.end(), step);  // the first trajectory to end after `step`
-        const auto trajectory = static_cast<size_t>(end - ends.begin());
-        const int left = static_cast<int>(*end - step);
-        return {trajectory, trajectories[trajectory].length() - left, std::min(context_length, left)};
+        return window_in(static_cast<size_t>(end - ends.begin()), step, context_length);
     }
+
+    // The same, of the trajectory that the step lies in; `ends` says all, which is in the cache when trajectories are not.
+    Window window_in(size_t trajectory, uint64_t step, int context_length) const {
+        const int start = static_cast<int>(step - steps_before(trajectory));
+        const int left = static_cast<int>(ends[trajectory] - step);
+        return {trajectory, start, std::min(context_length, left)};
+    }
+    uint64_t steps_before(size_t trajectory) const { return trajectory == 0 ? 0 : ends[trajectory - 1]; }
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
