@@ -451,14 +451,18 @@ struct KdTree {
 
 // A query on its way through a tree.
 struct Walk {
+    struct Subtree {
+        float distance;  // to the plane before it, squared
+        uint32_t node;
+    };
     size_t query;          // its index among the queries
     const float* point;    // [dim]
     uint32_t skipped;      // the entry that is no neighbour
     float reach;           // an entry farther away is none either
+    Subtree* subtrees;     // [KdTree::longest_path] a stack of those still to be visited
+    size_t waiting = 0;    // its height
     uint32_t at = 0;       // the node to be visited next
     bool fetched = false;  // if `at` is a leaf: whether it has been prefetched
-    size_t waiting = 0;    // height of the stack of subtrees still to be visited: (squared distance to the plane, node)
-    std::array<std::pair<float, uint32_t>, KdTree::longest_path> subtrees = {};
 
     // Visits one node; returns whether there is another to visit. A subtree beyond a plane can be left out if the plane
     // is too far: a point beyond has a coordinate at least that far, and rounding, being monotone, keeps that order in
@@ -479,9 +483,9 @@ struct Walk {
         }
         fetched = false;
         scan(tree, node, points, found);
-        while (waiting > 0 && subtrees[waiting - 1].first > reach) --waiting;
+        while (waiting > 0 && subtrees[waiting - 1].distance > reach) --waiting;
         if (waiting == 0) return false;
-        at = subtrees[--waiting].second;
+        at = subtrees[--waiting].node;
         return true;
     }
 
@@ -715,15 +719,21 @@ struct EpisodicMemory {
     Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
-        std::array<Walk, 16> walks;
+        constexpr size_t most = 16;
+        Walk walks[most];
+        Walk::Subtree stacks[most][KdTree::longest_path];  // not initialised: most walks need little of them
+        size_t begun = 0, active = 0;
+        const auto next = [&](Walk::Subtree* stack) {
+            const size_t i = begun++;
+            return Walk{i, &at[i * dim], skipped[i], limit, stack};
+        };
+        for (; active < std::min(n, most); ++active) walks[active] = next(stacks[active]);
         const Points p = points();
         vectorised<float>([&](auto) INLINE_LAMBDA {
-            for (size_t begun = 0, active = 0; begun < n || active > 0;) {
-                for (; begun < n && active < walks.size(); ++begun)
-                    walks[active++] = {begun, &at[begun * dim], skipped[begun], limit};
+            while (active > 0)
                 for (size_t i = active; i-- > 0;)
-                    if (!walks[i].step(tree, p, found)) walks[i] = walks[--active];
-            }
+                    if (!walks[i].step(tree, p, found))
+                        walks[i] = begun < n ? next(walks[i].subtrees) : walks[--active];
         });
         return found;
     }
