@@ -534,10 +534,12 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_line, 
     float* const panel = static_cast<float*>(to);
     if (used < Width) std::fill_n(panel, depth * Width, 0.0f);
     if (!view.transposed) {  // the lines lie side by side: copy along them
-        for (int k = 0; k < depth; ++k) {
-            const float* row = &view(first_k + k, first_line);
-            for (int line = 0; line < used; ++line) panel[k * Width + line] = row[line];
-        }
+        const float* row = &view(first_k, first_line);
+        for (int k = 0; k < depth; ++k, row += view.stride)
+            if (used == Width)
+                std::memcpy(panel + k * Width, row, sizeof(float) * Width);  // of a constant size: a few vectors
+            else
+                for (int line = 0; line < used; ++line) panel[k * Width + line] = row[line];
         return;
     }
     for (int first = 0; first < used; first += 4) {  // the lines lie along k: transpose blocks of 4 x 4
