@@ -1187,27 +1187,35 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation
 }
 
 // to[to_rows[i]] += from[from_rows[i]] for i < count, in this order, rows of d numbers; a null list: rows 0, 1, ...
-// Shared out by columns, since a row may be added to twice.
+// Shared out by columns, since a row may be added to twice. Store::overwrite, for rows that are all different: to what
+// was there nothing is added; it need not have been initialised.
 template <class T>
-void add_rows(Compute& compute, T* to, const int* to_rows, const T* from, const int* from_rows, int count, int d) {
+void add_rows(Compute& compute, T* to, const int* to_rows, const T* from, const int* from_rows, int count, int d,
+              Store store) {
     constexpr int group = 64;  // columns
     for_rows(compute, divide_up(d, group), count * group, [=](int begin, int end, int) {
-        for (ptrdiff_t i = 0; i < count; ++i) {
-            T* const sum = to + (to_rows ? to_rows[i] : i) * d;
-            const T* const row = from + (from_rows ? from_rows[i] : i) * d;
-            for (int j = begin * group; j < std::min(d, end * group); ++j) sum[j] += row[j];
-        }
+        vectorised<T>([=](auto) INLINE_LAMBDA {
+            for (ptrdiff_t i = 0; i < count; ++i) {
+                T* const sum = to + (to_rows ? to_rows[i] : i) * d;
+                const T* const row = from + (from_rows ? from_rows[i] : i) * d;
+                for (int j = begin * group; j < std::min(d, end * group); ++j)
+                    sum[j] = (store == Store::overwrite ? T(0) : sum[j]) + row[j];
+            }
+        });
     });
 }
 
 // add_rows of tensors [n, d]. Backward: from's gradient at from_rows[i] += to's gradient at to_rows[i].
 template <class T>
-void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows,
-                       int count) {
+void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T> from, const int* from_rows, int count,
+                       Store store = Store::accumulate) {
     Compute& compute = tape.compute;
-    add_rows<T>(compute, to.value, to_rows, from.value, from_rows, count, to.columns);
+    add_rows<T>(compute, to.value, to_rows, from.value, from_rows, count, to.columns, store);
     tape.on_backward(to, [=, &compute] {
-        add_rows<T>(compute, gradient_of(from), from_rows, to.grad(), to_rows, count, to.columns);
+        const bool every_row = !from_rows && count == from.rows;  // once: then no zeros are needed
+        const Store store_from = every_row ? next_store(from) : Store::accumulate;
+        T* const d_from = every_row ? from.grad() : gradient_of(from);
+        add_rows<T>(compute, d_from, from_rows, to.grad(), to_rows, count, to.columns, store_from);
     });
 }
 
@@ -1215,8 +1223,7 @@ void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T
 template <class T>
 Tensor<T> select_rows(Tape<T>& tape, Tensor<T> x, const int* rows, int count) {
     const Tensor<T> y = tape.make(count, x.columns);
-    std::fill_n(y.value, y.size(), T(0));
-    add_rows_by_index(tape, y, nullptr, x, rows, count);
+    add_rows_by_index(tape, y, nullptr, x, rows, count, Store::overwrite);
     return y;
 }
 
