@@ -2011,17 +2011,20 @@ Tensor<T> row_sums(Tape<T>& tape, std::array<Tensor<T>, 2> inputs, int rows, int
 template <class T>
 Tensor<T> gaussian_log_prob(Tape<T>& tape, Policy<T> policy, const float* actions) {
     const Tensor<T> mean = policy.output, log_std = policy.log_std;
-    const Tensor<T> a = tape.constant(actions, mean.rows, mean.columns);
-    const auto standardised = [=](ptrdiff_t i) {
-        return (std::atanh(a.value[i]) - mean.value[i]) / std::exp(log_std.value[i]);
-    };
+    const Tensor<T> u = tape.constant(actions, mean.rows, mean.columns);
+    T* const deviation = tape.template scratch<T>(u.size());  // [n, A] exp(log_std)
+    for (size_t i = 0; i < u.size(); ++i) {
+        u.value[i] = std::atanh(u.value[i]);
+        deviation[i] = std::exp(log_std.value[i]);
+    }
+    const auto standardised = [=](ptrdiff_t i) { return (u.value[i] - mean.value[i]) / deviation[i]; };
     const auto value = [=](ptrdiff_t i) {
         const T z = standardised(i);
-        return T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(std::atanh(a.value[i]));
+        return T(-0.5) * z * z - log_std.value[i] - T(half_log_2_pi) - log_tanh_slope(u.value[i]);
     };
-    return row_sums(tape, {mean, log_std}, a.rows, a.columns, value, [=](ptrdiff_t i, T dy) {
+    return row_sums(tape, {mean, log_std}, u.rows, u.columns, value, [=](ptrdiff_t i, T dy) {
         const T z = standardised(i);
-        mean.grad()[i] += dy * z / std::exp(log_std.value[i]);
+        mean.grad()[i] += dy * z / deviation[i];
         log_std.grad()[i] += dy * (z * z - T(1));
     });
 }
@@ -2058,10 +2061,13 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
 // H = -sum p log p of each row, exact, in nats. log_p [n, moves]. The derivative by log p is -p (log p + 1).
 template <class T>
 Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
-    return row_sums(
-        tape, {log_p}, log_p.rows, log_p.columns,
-        [=](ptrdiff_t i) { return -std::exp(log_p.value[i]) * log_p.value[i]; },
-        [=](ptrdiff_t i, T dy) { log_p.grad()[i] -= dy * std::exp(log_p.value[i]) * (log_p.value[i] + T(1)); });
+    T* const p = tape.template scratch<T>(log_p.size());
+    const auto value = [=](ptrdiff_t i) {
+        p[i] = std::exp(log_p.value[i]);
+        return -p[i] * log_p.value[i];
+    };
+    return row_sums(tape, {log_p}, log_p.rows, log_p.columns, value,
+                    [=](ptrdiff_t i, T dy) { log_p.grad()[i] -= dy * p[i] * (log_p.value[i] + T(1)); });
 }
 
 // DT's loss for continuous actions: the squared error of each row, averaged over the action's A dimensions.
