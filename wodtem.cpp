@@ -235,7 +235,15 @@ void write_step(Batch& batch, size_t i, const Agent& agent, const Trajectory& tr
 Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, std::span<const Window> windows) {
     Batch batch;
     size_t n = 0, i = 0;
-    for (const Window& window : windows) n += batch.sequences.lengths.emplace_back(window.length);
+    for (const Window& window : windows) {
+        n += batch.sequences.lengths.emplace_back(window.length);
+        // The data lie anywhere in memory: fetched now, all windows' come at the same time.
+        const Trajectory& trajectory = trajectories[window.trajectory];
+        __builtin_prefetch(&trajectory.states[window.start * agent.spec.state_dim]);
+        __builtin_prefetch(&trajectory.actions[window.start * agent.spec.action_dim]);
+        __builtin_prefetch(&trajectory.returns_to_go[window.start]);
+        __builtin_prefetch(&trajectory.discounted_returns[window.start]);
+    }
     batch.sequences.resize(n, agent.spec.state_dim, agent.model.config.action_dim);
     batch.actions.resize(n * agent.spec.action_dim);
     batch.discounted_returns.resize(n);
