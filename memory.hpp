@@ -286,7 +286,7 @@ struct ReplayBuffer {
         return window_in(static_cast<size_t>(end - ends.begin()), step, context_length);
     }
 
-    // The same, of the trajectory that the step lies in; `ends` says all, which is in the cache when trajectories are not.
+    // The same, of the trajectory that the step lies in. Reads `ends` alone: trajectories are rarely in the cache.
     Window window_in(size_t trajectory, uint64_t step, int context_length) const {
         const int start = static_cast<int>(step - steps_before(trajectory));
         const int left = static_cast<int>(ends[trajectory] - step);
@@ -824,14 +824,3 @@ struct EpisodicMemory {
         tree.build_node(points(), 0, tree.take_pair(dim), all);
     }
 };
-
-// e-hat(s_q) = sum_k p_k e_k, eq. (5) as the paper writes it, of K(s_q); NaN, that is unknown, for an empty one.
-// Training compares by is_optimal(), which does not form it; the tests hold the two to each other.
-inline double approximate_return(const EpisodicMemory& memory, std::span<const Neighbour> found) {
-    double sum = 0.0, normaliser = 0.0;
-    for (size_t k = 0; k < found.size(); ++k) {
-        sum += memory.similarity(found, k) * memory.e[found[k].entry];
-        normaliser += memory.similarity(found, k);
-    }
-    return sum / normaliser;
-}

@@ -4,16 +4,16 @@
 //   Random numbers philox, Random, Stream: counter-based
 //   Threads        Threads: a job shared out in numbered tasks
 //   Vector code    vectorised, Vector, lanes_at
-//   Products       View, matmul_plain (the definition); Kernel, compute_tile; matmul (the fast version); dot
+//   Products       View; Kernel, compute_tile; matmul; dot
 //   Tape           Tensor, Gradient, Tape: differentiation in reverse
-//   Operations     linear, layer_norm, dropout_add, attention_plain (the definition), attention; each with its backward
+//   Operations     linear, layer_norm, dropout_add, attention; each with its backward
 //   Parameters     Parameter, initialise
 //   Network        Transformer, token_layout, embed_tokens, transformer_block, forward: DT sec. 3, ODT sec. 3
 //   Policy heads   log_prob, entropy: squashed Gaussian, categorical, deterministic
 //   Optimisers     update_parameters: LAMB, AdamW, Adam
 //
 // Promises: row-major, last index fastest; float trains, double checks; the same seed gives the same bits for any
-// number of threads, on one instruction set (all fused kernels agree, and the portable one with the plain version).
+// number of threads, on one instruction set (all fused kernels agree, and the portable one with tests/plain.hpp).
 // Leaves out: how returns are computed; episodes, environments, files, options.
 #pragma once
 
@@ -372,20 +372,6 @@ constexpr int sum_block = 256;
 // Whether a result replaces what is in its place or is added to it.
 enum class Store { overwrite, accumulate };
 
-// The definition of a product. The fast version below is held to it by tests.
-template <class T>
-void matmul_plain(View<T> c, View<const T> a, View<const T> b, int M, int N, int K, Store store) {
-    for (int i = 0; i < M; ++i)
-        for (int j = 0; j < N; ++j) {
-            if (store == Store::overwrite) c(i, j) = 0;
-            for (int first = 0; first < K; first += sum_block) {
-                T sum = 0;
-                for (int k = first; k < std::min(K, first + sum_block); ++k) sum += a(i, k) * b(k, j);
-                c(i, j) += sum;
-            }
-        }
-}
-
 // ---------------------------------------------------------------------------------------------------------------------
 // Kernels. A kernel computes one tile of C from packed panels of A and B: a panel holds the elements of a few rows of A
 // (or columns of B), called its lines, in the order in which the kernel reads them: [k, line].
@@ -411,7 +397,7 @@ struct Kernel {
     const char* name;
     const char* precision;  // "fp32", or "bf16": A and B are rounded to bf16, sums stay float
     // Kernels of equal arithmetic give the same bits: "fused" rounds once for a multiply-add, "plain" twice, as
-    // matmul_plain does; "bf16" is the arithmetic of bf16_multiply_add.
+    // matmul_plain in tests/plain.hpp does; "bf16" is the arithmetic of bf16_multiply_add.
     const char* arithmetic;
     int tile_rows, tile_columns;
     int k_a_word;         // values of k that a word of 4 bytes in a panel holds: one float or two bf16
@@ -807,9 +793,9 @@ inline void multiply_block(const Kernel& kernel, Buffer& scratch, View<float> c,
         }
 }
 
-// The fast version of matmul_plain, c [M, N] = or += a [M, K] b [K, N], then the epilogue. Two rounds of tasks: B is
-// packed, in steps of sum_block k; then each task computes a block of C, packing its rows of A on the way. A frozen
-// weight is packed once for many products.
+// c [M, N] = or += a [M, K] b [K, N], then the epilogue (double: tests/plain.hpp). Two rounds of tasks: B is packed,
+// in steps of sum_block k; then each task computes a block of C, packing its rows of A on the way. A frozen weight is
+// packed once for many products.
 inline void matmul(Compute& compute, View<float> c, View<const float> a, View<const float> b, int M, int N, int K,
                    Store store, Epilogue<float> epilogue = {}) {
     if (M == 0 || N == 0) return;
@@ -855,15 +841,6 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     };
     compute.reserve_scratch(kernel.panel_bytes(Compute::block_rows, sum_block));
     compute.threads.run(row_blocks * column_blocks, multiply, serial);
-}
-
-// In double, for checks alone.
-inline void matmul(Compute& compute, View<double> c, View<const double> a, View<const double> b, int M, int N, int K,
-                   Store store, Epilogue<double> epilogue = {}) {
-    compute.threads.run(M, [&](int i, int) {
-        matmul_plain<double>({&c(i, 0), c.stride}, {&a(i, 0), a.stride, a.transposed}, b, 1, N, K, store);
-    });
-    apply_epilogue(c, epilogue, {0, M, 0, N});
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1371,26 +1348,6 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
         });
     });
     return y;
-}
-
-// Causal attention, plain, one head: out [n, d] = softmax over keys j <= i of (q_i . k_j / sqrt(d)), times v_j.
-// q, k, v [n, d] of one sequence. The specification; `attention` below is held to it.
-template <class T>
-void attention_plain(T* out, const T* q, const T* k, const T* v, int n, int d) {
-    std::vector<T> weight(n);
-    for (int i = 0; i < n; ++i) {
-        T total = 0;
-        for (int j = 0; j <= i; ++j) {
-            T score = 0;
-            for (int c = 0; c < d; ++c) score += q[i * d + c] * k[j * d + c];
-            weight[j] = std::exp(score / std::sqrt(T(d)));
-            total += weight[j];
-        }
-        for (int c = 0; c < d; ++c) {
-            out[i * d + c] = 0;
-            for (int j = 0; j <= i; ++j) out[i * d + c] += weight[j] / total * v[j * d + c];
-        }
-    }
 }
 
 // to = or += sum_j weight_j row_j, for Width * Vectors columns, held in registers (where there are enough).

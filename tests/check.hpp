@@ -11,6 +11,7 @@
 #pragma once
 
 #include "chain_statistics.hpp"
+#include "plain.hpp"
 
 namespace vectors {
 

@@ -7,6 +7,7 @@
 #include "../data/state.hpp"
 #include "../memory.hpp"
 #include "memory_bytes.hpp"
+#include "plain.hpp"
 #include "test.hpp"
 
 namespace {

@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "plain.hpp"
 #include "test.hpp"
 
 namespace {

@@ -12,6 +12,7 @@
 
 #include "../data/sac.hpp"
 #include "../mujoco_env.hpp"
+#include "plain.hpp"
 #include "test.hpp"
 
 namespace {
