@@ -391,22 +391,27 @@ using TileFunction = void (*)(const Tile& tile, const void* a, const void* b, in
 // panel is view(first_k + k, first_line + line).
 using PackFunction = void (*)(void* panel, View<const float> view, int first_k, int first_line, int depth, int used);
 
+// How a kernel adds a product to a sum: rounding twice, as matmul_plain in tests/plain.hpp does, or once; or A and B
+// are rounded to bf16 and sums stay float, by the processor or imitated, see bf16_multiply_add.
+enum class Multiply { plain, fused, bf16, bf16_portable };
+constexpr bool in_bf16(Multiply how) { return how == Multiply::bf16 || how == Multiply::bf16_portable; }
+constexpr int k_a_word(Multiply how) { return in_bf16(how) ? 2 : 1; }  // numbers in a word of 4 bytes of a panel
+
 // One way to compute the products of float matrices. The sharing-out below knows a kernel by this record alone; panels
 // are opaque to it.
 struct Kernel {
     const char* name;
-    const char* precision;  // "fp32", or "bf16": A and B are rounded to bf16, sums stay float
-    // Kernels of equal arithmetic give the same bits: "fused" rounds once for a multiply-add, "plain" twice, as
-    // matmul_plain in tests/plain.hpp does; "bf16" is the arithmetic of bf16_multiply_add.
-    const char* arithmetic;
+    Multiply how;
     int tile_rows, tile_columns;
-    int k_a_word;         // values of k that a word of 4 bytes in a panel holds: one float or two bf16
     bool (*supported)();  // by this machine
     PackFunction pack_a, pack_b;
     TileFunction tile;
 
+    const char* precision() const { return in_bf16(how) ? "bf16" : "fp32"; }
+    // Kernels of equal arithmetic give the same bits.
+    const char* arithmetic() const { return in_bf16(how) ? "bf16" : how == Multiply::fused ? "fused" : "plain"; }
     // Bytes of panels of `lines` lines in all, `depth` values of k each.
-    size_t panel_bytes(int lines, int depth) const { return size_t{4} * lines * divide_up(depth, k_a_word); }
+    size_t panel_bytes(int lines, int depth) const { return size_t{4} * lines * divide_up(depth, k_a_word(how)); }
 };
 
 // bf16 is the upper half of a float: 8 bits of mantissa, the leading one included. Rounds to nearest even; NaN stays,
@@ -426,9 +431,6 @@ ALWAYS_INLINE float bf16_multiply_add(float sum, float a_word, float b_word) {
     sum = normal(std::fma(value(a & 0xffff0000), value(b & 0xffff0000), normal(sum)));
     return normal(std::fma(value(a << 16), value(b << 16), sum));
 }
-
-enum class Multiply { plain, fused, bf16, bf16_portable };
-constexpr bool in_bf16(Multiply how) { return how == Multiply::bf16 || how == Multiply::bf16_portable; }
 
 // sum += a * b in each lane. GCC 12 has no portable vector multiply-add, so two forms are one instruction by name.
 template <Multiply How, class V>
@@ -453,14 +455,14 @@ ALWAYS_INLINE void multiply_add(V& sum, const V& a, const V& b) {
 // 12 x 2 sums fill 24 of AVX-512's 32 registers and 6 x 2 sums 12 of AVX2's 16; the others hold A's and B's elements.
 template <int Rows, int Vectors, int Width, Multiply How>
 ALWAYS_INLINE void compute_tile(const Tile& tile, const void* a_panel, const void* b_panel, int depth) {
-    constexpr int columns = Width * Vectors, k_a_word = in_bf16(How) ? 2 : 1;
+    constexpr int columns = Width * Vectors;
     const float *a = static_cast<const float*>(a_panel), *b = static_cast<const float*>(b_panel);
     // C may be far from the cache, and is needed only at the end.
     for (int r = 0; r < tile.rows; ++r)
         for (int j = 0; j < tile.columns; j += 16)
             __builtin_prefetch(tile.c + static_cast<ptrdiff_t>(r) * tile.stride + j, 1);
     Vector<float, Width> sum[Rows][Vectors] = {};
-    for (int k = 0; k < depth; k += k_a_word) {
+    for (int k = 0; k < depth; k += k_a_word(How)) {
         Vector<float, Width> row_of_b[Vectors];
 #pragma GCC unroll 4
         for (int v = 0; v < Vectors; ++v) {
@@ -602,55 +604,41 @@ ALWAYS_INLINE void pack_bf16(void* to, View<const float> view, int first_k, int 
     pack_floats<Width>(to, {buffer, view.transposed ? words : Width, view.transposed}, 0, 0, words, used);
 }
 
-// A kernel's record; tile and packing must be compiled for its instructions.
-template <Multiply How, int Rows, int Columns>
-constexpr Kernel make_kernel(const char* name, bool (*supported)(), PackFunction pack_a, PackFunction pack_b,
-                             TileFunction tile) {
-    const char* const arithmetic = in_bf16(How) ? "bf16" : How == Multiply::fused ? "fused" : "plain";
-    const char* const precision = in_bf16(How) ? "bf16" : "fp32";
-    return {name, precision, arithmetic, Rows, Columns, in_bf16(How) ? 2 : 1, supported, pack_a, pack_b, tile};
-}
-
+// The kernels' records; tile and packing must be compiled for a kernel's instructions.
 #ifdef X86_KERNELS
 __attribute__((target("avx512f"))) inline void tile_avx512(const Tile& tile, const void* a, const void* b, int depth) {
     compute_tile<12, 2, 16, Multiply::fused>(tile, a, b, depth);
 }
-inline const Kernel kernel_avx512 = make_kernel<Multiply::fused, 12, 32>(
-    "avx512", [] { return __builtin_cpu_supports("avx512f") != 0; }, pack_floats<12>, pack_floats<32>, tile_avx512);
+inline const Kernel kernel_avx512(
+    "avx512", Multiply::fused, 12, 32, [] { return __builtin_cpu_supports("avx512f") != 0; }, pack_floats<12>,
+    pack_floats<32>, tile_avx512);
 
 __attribute__((target("avx2,fma"))) inline void tile_avx2(const Tile& tile, const void* a, const void* b, int depth) {
     compute_tile<6, 2, 8, Multiply::fused>(tile, a, b, depth);
 }
-inline const Kernel kernel_avx2 = make_kernel<Multiply::fused, 6, 16>(
-    "avx2", [] { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); }, pack_floats<6>,
-    pack_floats<16>, tile_avx2);
+inline const Kernel kernel_avx2(
+    "avx2", Multiply::fused, 6, 16, [] { return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); },
+    pack_floats<6>, pack_floats<16>, tile_avx2);
 
-__attribute__((target("arch=x86-64-v4,avx512bf16"))) inline void tile_avx512_bf16(const Tile& tile, const void* a,
-                                                                                  const void* b, int depth) {
+#define BF16_TARGET __attribute__((target("arch=x86-64-v4,avx512bf16")))
+BF16_TARGET inline void tile_avx512_bf16(const Tile& tile, const void* a, const void* b, int depth) {
     compute_tile<12, 2, 16, Multiply::bf16>(tile, a, b, depth);
 }
 template <int Width>
-__attribute__((target("arch=x86-64-v4,avx512bf16"))) void pack_bf16_avx512(void* to, View<const float> view,
-                                                                           int first_k, int first_line, int depth,
-                                                                           int used) {
+BF16_TARGET void pack_bf16_avx512(void* to, View<const float> view, int first_k, int first_line, int depth, int used) {
     pack_bf16<Width, Multiply::bf16>(to, view, first_k, first_line, depth, used);
 }
-inline const Kernel kernel_avx512_bf16 = make_kernel<Multiply::bf16, 12, 32>(
-    "avx512", [] { return has_avx512 && __builtin_cpu_supports("avx512bf16"); }, pack_bf16_avx512<12>,
-    pack_bf16_avx512<32>, tile_avx512_bf16);
+inline const Kernel kernel_avx512_bf16(
+    "avx512", Multiply::bf16, 12, 32, [] { return has_avx512 && __builtin_cpu_supports("avx512bf16"); },
+    pack_bf16_avx512<12>, pack_bf16_avx512<32>, tile_avx512_bf16);
 #endif
-inline void tile_portable(const Tile& tile, const void* a, const void* b, int depth) {
-    compute_tile<4, 2, 4, Multiply::plain>(tile, a, b, depth);
-}
-inline const Kernel kernel_portable = make_kernel<Multiply::plain, 4, 8>(
-    "portable", [] { return true; }, pack_floats<4>, pack_floats<8>, tile_portable);
 
-inline void tile_portable_bf16(const Tile& tile, const void* a, const void* b, int depth) {
-    compute_tile<4, 2, 4, Multiply::bf16_portable>(tile, a, b, depth);
-}
-inline const Kernel kernel_portable_bf16 = make_kernel<Multiply::bf16_portable, 4, 8>(
-    "portable", [] { return true; }, pack_bf16<4, Multiply::bf16_portable>, pack_bf16<8, Multiply::bf16_portable>,
-    tile_portable_bf16);
+inline const Kernel kernel_portable(
+    "portable", Multiply::plain, 4, 8, [] { return true; }, pack_floats<4>, pack_floats<8>,
+    compute_tile<4, 2, 4, Multiply::plain>);
+inline const Kernel kernel_portable_bf16(
+    "portable", Multiply::bf16_portable, 4, 8, [] { return true; }, pack_bf16<4, Multiply::bf16_portable>,
+    pack_bf16<8, Multiply::bf16_portable>, compute_tile<4, 2, 4, Multiply::bf16_portable>);
 
 // All kernels of this program, of each precision the best first.
 inline const Kernel* const kernels[] = {

@@ -269,8 +269,8 @@ inline const Kernel& kernel_of(const Arguments& arguments) {
     for (const Kernel* kernel : kernels) {
         if (!kernel->supported()) continue;
         const bool chosen = name == kernel->name || (name == "auto" && kernel != &kernel_portable_bf16);
-        if (chosen && precision == kernel->precision) return *kernel;
-        available += std::string(available.empty() ? "" : ", ") + kernel->name + " " + kernel->precision;
+        if (chosen && precision == kernel->precision()) return *kernel;
+        available += std::string(available.empty() ? "" : ", ") + kernel->name + " " + kernel->precision();
     }
     fail("usage.kernel",
          "this machine has no kernel \"%s\" for precision \"%s\"; it has: %s. Choose with --kernel and --precision "
@@ -281,7 +281,7 @@ inline const Kernel& kernel_of(const Arguments& arguments) {
 // The best kernel that gives the bits of a run's setting `arithmetic`. Errors: usage.kernel.
 inline const Kernel& kernel_for(const std::string& arithmetic) {
     for (const Kernel* kernel : kernels)
-        if (kernel->supported() && arithmetic == kernel->arithmetic) return *kernel;
+        if (kernel->supported() && arithmetic == kernel->arithmetic()) return *kernel;
     fail("usage.kernel", "this machine has no kernel of arithmetic %s", arithmetic.c_str());
 }
 
@@ -409,7 +409,7 @@ inline Settings settings_of(const Arguments& arguments, const std::string& task,
     if (arguments.has("--physics")) set_from(settings, "physics", arguments["--physics"], "command line");
     apply_assignments(settings, arguments.assignments);
     check_together(settings);
-    settings.arithmetic = kernel_of(arguments).arithmetic;
+    settings.arithmetic = kernel_of(arguments).arithmetic();
     return settings;
 }
 

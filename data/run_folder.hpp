@@ -292,7 +292,7 @@ inline std::string machine_text(const Kernel& kernel, int threads) {
         if (line.starts_with("model name") && line.find(": ") != std::string::npos)
             processor = line.substr(line.find(": ") + 2);
     std::erase(processor, ',');
-    return processor + "; kernel " + kernel.name + " " + kernel.precision + "; threads " + std::to_string(threads);
+    return processor + "; kernel " + kernel.name + " " + kernel.precision() + "; threads " + std::to_string(threads);
 }
 
 struct RunFolder {

@@ -491,7 +491,8 @@ inline std::string settings_text(const Learner& learner, const std::string& note
                   s.seed, s.hidden, s.batch, static_cast<unsigned long long>(s.capacity),
                   static_cast<unsigned long long>(s.random_steps), static_cast<unsigned long long>(s.steps_per_update),
                   s.learning_rate, s.discount, s.target_rate, s.reward_scale, learner.spec.state_dim,
-                  learner.spec.action_dim, learner.spec.max_episode_steps, learner.learning.compute.kernel.arithmetic);
+                  learner.spec.action_dim, learner.spec.max_episode_steps,
+                  learner.learning.compute.kernel.arithmetic());
     return text + note;
 }
 

@@ -131,7 +131,7 @@ __attribute__((target("arch=x86-64-v4,avx512bf16"))) float burn_bf16(int64_t rou
 double burn_rate(const Kernel& kernel) {
     float (*burn)(int64_t) = burn_vectors<Vector<float, 4>, Multiply::plain>;
     if (&kernel == &kernel_portable_bf16) burn = burn_vectors<Vector<float, 4>, Multiply::bf16_portable>;
-    const double operations = 2.0 * burn_chains * kernel.tile_columns / 2 * kernel.k_a_word;
+    const double operations = 2.0 * burn_chains * kernel.tile_columns / 2 * k_a_word(kernel.how);
 #ifdef X86_KERNELS
     if (&kernel == &kernel_avx512) burn = burn_avx512;
     if (&kernel == &kernel_avx2) burn = burn_avx2;
@@ -143,7 +143,7 @@ double burn_rate(const Kernel& kernel) {
     return operations * rounds / seconds;
 }
 
-std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic; }
+std::string label(const Kernel& kernel) { return std::string(kernel.name) + " " + kernel.arithmetic(); }
 
 float sum_of(const float* x, size_t n) {
     typedef float Lanes __attribute__((vector_size(256), aligned(4), may_alias));  // four vectors of 16 in flight
@@ -321,7 +321,7 @@ void bench_acting(Measurements& measured, Run& run, size_t episodes, const Rates
                  layers = static_cast<double>(run.agent.settings.layers);
     const double operations = 2 * static_cast<double>(episodes) *
                               ((layers - 1) * tokens * (12 * d * d + tokens * d) + tokens * 2 * d * d + 10 * d * d),
-                 bytes = 12 * layers * d * d * 4.0 / kernel.k_a_word;
+                 bytes = 12 * layers * d * d * 4.0 / k_a_word(kernel.how);
     measured.add({"acting, one step of the gym network, windows of " + std::to_string(batch.lengths[0]) +
                       "; share of the products' own rate or the memory's speed",
                   std::to_string(episodes) + " episodes, " + label(kernel), time, operations, bytes,
@@ -498,7 +498,7 @@ void bench_all(const std::string& kernel_name, int threads, bool json) {
     Measurements measured{json, {}};
     std::vector<const Kernel*> chosen;  // the best of each precision, or those of the name
     for (const Kernel* kernel : kernels) {
-        const auto alike = [=](const Kernel* other) { return !std::strcmp(other->precision, kernel->precision); };
+        const auto alike = [=](const Kernel* other) { return !std::strcmp(other->precision(), kernel->precision()); };
         const bool best = kernel != &kernel_portable_bf16 && std::ranges::none_of(chosen, alike);
         if (kernel->supported() && (kernel_name == "auto" ? best : kernel_name == kernel->name))
             chosen.push_back(kernel);

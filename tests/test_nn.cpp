@@ -242,7 +242,7 @@ struct Product {
 };
 
 Product product(const float* a, const float* b, int K, int N, float start, const Kernel& kernel) {
-    const bool fused = kernel.arithmetic == std::string("fused"), bf16 = kernel.precision == std::string("bf16");
+    const bool fused = kernel.arithmetic() == std::string("fused"), bf16 = kernel.precision() == std::string("bf16");
     Product p = {start, start, std::fabs(start)};
     for (int first = 0; first < K; first += 256) {
         const int end = std::min(K, first + 256);
@@ -286,14 +286,14 @@ void check_matmul(Compute& compute, Draws& draws, int M, int N, int K) {
                 const Store how = store == 0 ? Store::overwrite : Store::accumulate;
                 matmul(compute, View<float>{c.data(), N + 3}, stored_a.view, stored_b.view, M, N, K, how);
                 bool same = same_bits(c, expected[store]);
-                if (compute.kernel.arithmetic == std::string("plain")) {
+                if (compute.kernel.arithmetic() == std::string("plain")) {
                     const View<float> to = {plain.data(), N + 3};
                     matmul_plain(to, stored_a.view, stored_b.view, M, N, K, how);
                     same = same && same_bits(c, plain);
                 }
                 if (!same)
                     report_failure(__FILE__, __LINE__,
-                                   std::string(compute.kernel.name) + " " + compute.kernel.arithmetic + ", threads " +
+                                   std::string(compute.kernel.name) + " " + compute.kernel.arithmetic() + ", threads " +
                                        shown(compute.threads.count()) + ", M N K " + shown(M) + " " + shown(N) + " " +
                                        shown(K) + ", transposed " + shown(a_transposed) + shown(b_transposed) +
                                        ", store " + shown(store));
@@ -432,7 +432,7 @@ TEST(bf16_rounds_to_the_nearest_and_of_two_to_the_even_one) {
 TEST(numbers_are_packed_as_bf16_by_the_definition) {
     constexpr int depth = 64, lines = 32;
     for (const Kernel* kernel : kernels_of_this_machine()) {
-        if (kernel->precision != std::string("bf16")) continue;
+        if (kernel->precision() != std::string("bf16")) continue;
         for (const uint32_t low : {0u, 1u, 0x7fffu, 0x8000u, 0x8001u, 0xffffu})
             for (uint32_t upper = 0; upper < 0x10000; upper += depth * lines) {
                 std::vector<float> x;  // [depth, lines]
@@ -465,7 +465,7 @@ TEST(bf16_kernels_have_the_same_bits_on_all_kinds_of_numbers) {
     constexpr int size = 48, depth = 6;
     std::vector<const Kernel*> found;
     for (const Kernel* kernel : kernels_of_this_machine())
-        if (kernel->precision == std::string("bf16")) found.push_back(kernel);
+        if (kernel->precision() == std::string("bf16")) found.push_back(kernel);
     for (uint32_t round = 0; round < 200; ++round) {
         std::vector<float> a, b;
         for (uint32_t i = 0; i < size * depth; ++i) {
@@ -490,7 +490,7 @@ TEST(bf16_kernels_have_the_same_bits_on_all_kinds_of_numbers) {
 
 TEST(the_best_kernel_is_the_first_that_the_machine_supports) {
     CHECK_EQUAL(&best_kernel(), kernels_of_this_machine().front());
-    CHECK_EQUAL(kernel_portable.arithmetic, std::string("plain"));
+    CHECK_EQUAL(kernel_portable.arithmetic(), std::string("plain"));
     CHECK(kernel_portable.supported());
 }
 

@@ -41,7 +41,7 @@ Settings tiny_settings(const std::string& method, const std::string& alpha = "0.
         set_setting(settings, name, value);
     if (method != "dt") set_setting(settings, "online_steps", "400");
     set_setting(settings, "alpha", alpha);
-    settings.arithmetic = best_kernel().arithmetic;
+    settings.arithmetic = best_kernel().arithmetic();
     return settings;
 }
 
@@ -918,7 +918,7 @@ TEST(promises_hold_in_every_arithmetic) {
             for (auto [name, value] : std::initializer_list<std::pair<const char*, const char*>>{
                      {"offline_updates", "5"}, {"online_steps", "150"}, {"updates_per_iteration", "1"}})
                 set_setting(all, name, value);
-            all.arithmetic = kernel->arithmetic;
+            all.arithmetic = kernel->arithmetic();
             return all;
         };
         quiet_train(settings("odt", "1"), scratch / "odt");
@@ -1227,7 +1227,7 @@ Settings own_settings(const std::string& path, const std::string& method) {
                                                                                          {"learning_rate", "0.01"},
                                                                                          {"warmup_updates", "10"}})
         set_from(settings, name, value, "command line");
-    settings.arithmetic = best_kernel().arithmetic;
+    settings.arithmetic = best_kernel().arithmetic();
     return settings;
 }
 
@@ -2084,7 +2084,7 @@ Settings tiny_mujoco_settings(const std::string& task, const std::string& method
                                                                                          {"buffer_size", "5"}})
         set_setting(settings, name, value);
     if (method != "dt") set_setting(settings, "online_steps", task.starts_with("hopper") ? "120" : "1000");
-    settings.arithmetic = best_kernel().arithmetic;
+    settings.arithmetic = best_kernel().arithmetic();
     settings.mujoco = mujoco_version();
     return settings;
 }
