@@ -2157,21 +2157,24 @@ bool adam_step(float* __restrict gradient, float* __restrict m, float* __restric
     const float clip = static_cast<float>(scale), root_bias2 = static_cast<float>(std::sqrt(bias2));
     const float inverse_bias1 = static_cast<float>(1 / bias1), epsilon = static_cast<float>(config.epsilon);
     const float decay = config.rule == OptimizerConfig::Rule::lamb ? static_cast<float>(config.weight_decay) : 0.0f;
-    const bool unbiased = root_bias2 == 1.0f;  // from update 16,628 on if beta2 is 0.999: one slow division less
     int bad = 0;
-    vectorised<float>([=, &bad](auto) INLINE_LAMBDA {
-        int any = 0;
-        for (size_t i = 0; i < n; ++i) {
-            const float g = gradient[i] * clip;
-            m[i] = beta1 * m[i] + one_minus_1 * g;
-            v[i] = beta2 * v[i] + one_minus_2 * g * g;
-            const float root = unbiased ? std::sqrt(v[i]) : std::sqrt(v[i]) / root_bias2;
-            const float u = m[i] * inverse_bias1 / (root + epsilon) + decay * value[i];
-            if (At_once) any |= move_weight(value[i], u, shrink, rate);
-            gradient[i] = At_once ? 0.0f : u;
-        }
-        bad = any;
-    });
+    const auto run = [&](auto unbiased) {
+        vectorised<float>([=, &bad](auto) INLINE_LAMBDA {
+            int any = 0;
+            for (size_t i = 0; i < n; ++i) {
+                const float g = gradient[i] * clip;
+                m[i] = beta1 * m[i] + one_minus_1 * g;
+                v[i] = beta2 * v[i] + one_minus_2 * g * g;
+                const float root = unbiased ? std::sqrt(v[i]) : std::sqrt(v[i]) / root_bias2;
+                const float u = m[i] * inverse_bias1 / (root + epsilon) + decay * value[i];
+                if (At_once) any |= move_weight(value[i], u, shrink, rate);
+                gradient[i] = At_once ? 0.0f : u;
+            }
+            bad = any;
+        });
+    };
+    // From update 16,628 on, if beta2 is 0.999, the correction is 1: one slow division less.
+    root_bias2 == 1.0f ? run(std::true_type{}) : run(std::false_type{});
     return bad != 0;
 }
 
