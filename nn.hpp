@@ -676,14 +676,10 @@ struct Buffer {
     }
 };
 
-// The packed form of weights, for as long as a FrozenWeights lives.
-struct PackedWeights {
-    struct Entry {
-        Buffer panels;
-        bool valid = false;
-    };
-    bool frozen = false;
-    std::map<std::tuple<const float*, int, bool, int, int>, Entry> entries;  // by data, stride, transposed, K, N
+// The packed form of a weight, for as long as a FrozenWeights lives.
+struct PackedWeight {
+    Buffer panels;
+    bool valid = false;
 };
 
 // Threads, kernel and scratch memory: what every operation below needs in order to run.
@@ -692,7 +688,8 @@ struct Compute {
     const Kernel& kernel;
     Threads threads;
     Buffer packed_b;
-    PackedWeights packed_weights;
+    std::map<std::tuple<const float*, int, bool, int, int>, PackedWeight> weights;  // by data, stride, transposed, K, N
+    bool weights_frozen = false;
     std::vector<Buffer> scratch;               // one per worker, for a task: a block of A in panels, a head's rows
     Buffer sums;                               // of block_sums
     std::function<bool()> asked_to_stop = {};  // see FrozenWeights
@@ -713,12 +710,12 @@ struct Compute {
 struct FrozenWeights {
     Compute& compute;
     explicit FrozenWeights(Compute& c) : compute(c) {
-        for (auto& [key, entry] : compute.packed_weights.entries) entry.valid = false;
-        compute.packed_weights.frozen = true;
+        for (auto& [key, weight] : compute.weights) weight.valid = false;
+        compute.weights_frozen = true;
         compute.threads.asked_to_stop = compute.asked_to_stop;
     }
     ~FrozenWeights() {
-        compute.packed_weights.frozen = false;
+        compute.weights_frozen = false;
         compute.threads.asked_to_stop = nullptr;
     }
     FrozenWeights(const FrozenWeights&) = delete;
@@ -765,22 +762,6 @@ inline void pack_panels(const Kernel& kernel, PackFunction pack, int width, char
     }
 }
 
-// C's block = or += A's rows times panels of B, for `depth` k from first_k on.
-inline void multiply_block(const Kernel& kernel, Buffer& scratch, View<float> c, View<const float> a,
-                           const char* packed_b, const Block& block, int first_k, int depth, Store store) {
-    char* const packed_a = scratch.room(kernel.panel_bytes(Compute::block_rows, sum_block));
-    const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // the lines of A are its rows
-    pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
-                block.end_row);
-    for (int j = block.first_column; j < block.end_column; j += kernel.tile_columns)
-        for (int i = block.first_row; i < block.end_row; i += kernel.tile_rows) {
-            const Tile tile = {&c(i, j), c.stride, std::min(kernel.tile_rows, block.end_row - i),
-                               std::min(kernel.tile_columns, block.end_column - j), store};
-            kernel.tile(tile, packed_a + kernel.panel_bytes(i - block.first_row, depth),
-                        packed_b + kernel.panel_bytes(j, depth), depth);
-        }
-}
-
 // c [M, N] = or += a [M, K] b [K, N], then the epilogue (double: tests/plain.hpp). Two rounds of tasks: B is packed,
 // in steps of sum_block k; then each task computes a block of C, packing its rows of A on the way. A frozen weight is
 // packed once for many products.
@@ -798,9 +779,8 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     const int row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
     const int column_blocks = std::clamp(std::max(8, 4 * threads) / row_blocks, 1, std::max(1, panels / 4));
 
-    PackedWeights& weights = compute.packed_weights;
-    PackedWeights::Entry* cached = nullptr;
-    if (b.weight && weights.frozen) cached = &weights.entries[{b.data, b.stride, b.transposed, K, N}];
+    PackedWeight* cached = nullptr;
+    if (b.weight && compute.weights_frozen) cached = &compute.weights[{b.data, b.stride, b.transposed, K, N}];
     Buffer& buffer = cached ? cached->panels : compute.packed_b;
     const bool packed_before = cached && cached->valid;
     const int steps = divide_up(K, sum_block), panels_a_task = std::max(1, panels / std::max(8, threads));
@@ -822,9 +802,21 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
         const auto row = [&](int n) { return std::min(M, tiles * n / row_blocks * kernel.tile_rows); };
         const auto column = [&](int n) { return std::min(N, panels * n / column_blocks * kernel.tile_columns); };
         const Block block = {row(i), row(i + 1), column(j), column(j + 1)};
-        for (int step = 0; step < steps; ++step)
-            multiply_block(kernel, compute.scratch[worker], c, a, packed + step * step_bytes, block, step * sum_block,
-                           std::min(sum_block, K - step * sum_block), step > 0 ? Store::accumulate : store);
+        char* const packed_a = compute.scratch[worker].room(kernel.panel_bytes(Compute::block_rows, sum_block));
+        const View<const float> a_lines = {a.data, a.stride, !a.transposed};  // the lines of A are its rows
+        for (int step = 0; step < steps; ++step) {
+            const int first_k = step * sum_block, depth = std::min(sum_block, K - first_k);
+            pack_panels(kernel, kernel.pack_a, kernel.tile_rows, packed_a, a_lines, first_k, depth, block.first_row,
+                        block.end_row);
+            for (int n = block.first_column; n < block.end_column; n += kernel.tile_columns)
+                for (int m = block.first_row; m < block.end_row; m += kernel.tile_rows) {
+                    const Tile tile = {&c(m, n), c.stride, std::min(kernel.tile_rows, block.end_row - m),
+                                       std::min(kernel.tile_columns, block.end_column - n),
+                                       step > 0 ? Store::accumulate : store};
+                    kernel.tile(tile, packed_a + kernel.panel_bytes(m - block.first_row, depth),
+                                packed + step * step_bytes + kernel.panel_bytes(n, depth), depth);
+                }
+        }
         apply_epilogue(c, epilogue, block);
     };
     compute.reserve_scratch(kernel.panel_bytes(Compute::block_rows, sum_block));
@@ -1131,17 +1123,15 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, int first,
         });
         add_column_sums(compute, db, sums, divide_up(y.rows, rows_a_sum), count, count);
         const View<const T> dy = {d_out, count}, in = {x.value, x.columns};
-        const View<const T> dy_transposed = {d_out, count, true}, in_transposed = {x.value, x.columns, true};
         if (x.gradient) {  // dx += dy W^T
             const Store store = next_store(x);
             matmul(compute, View<T>{x.grad(), x.columns}, dy, {w.value + offset, w.columns, !transposed, true}, x.rows,
                    x.columns, count, store);
         }
-        const View<T> d_weight = {dw, w.columns};
-        if (transposed)  // dW^T += dy^T x
-            matmul(compute, d_weight, dy_transposed, in, count, x.columns, x.rows, Store::accumulate);
-        else  // dW += x^T dy
-            matmul(compute, d_weight, in_transposed, dy, x.columns, count, x.rows, Store::accumulate);
+        // dW += x^T dy, or dW^T += dy^T x; here a stride is the number of columns
+        const auto [left, right] = transposed ? std::pair(dy, in) : std::pair(in, dy);
+        matmul(compute, View<T>{dw, w.columns}, {left.data, left.stride, true}, right, left.stride, right.stride,
+               x.rows, Store::accumulate);
     });
     return y;
 }
@@ -1314,11 +1304,10 @@ Tensor<T> dropout_add(Tape<T>& tape, Tensor<T> x, const Dropout& dropout, Tensor
     Compute& compute = tape.compute;
     for_rows(compute, x.rows, 4 * x.columns, [=](int begin, int end, int) {
         vectorised<T>([=](auto) INLINE_LAMBDA {
-            const ptrdiff_t first = begin * d, last = end * d;
-            if (residual.value)
-                for (ptrdiff_t i = first; i < last; ++i) y.value[i] = x.value[i] * mask.factor(i) + residual.value[i];
-            else
-                for (ptrdiff_t i = first; i < last; ++i) y.value[i] = x.value[i] * mask.factor(i);
+            for (ptrdiff_t i = begin * d; i < end * d; ++i) {
+                const T dropped = x.value[i] * mask.factor(i);
+                y.value[i] = residual.value ? dropped + residual.value[i] : dropped;
+            }
         });
     });
     tape.on_backward(y, [=, &compute] {  // dx += dy * factor; d_residual += dy
@@ -2056,13 +2045,11 @@ Tensor<T> weighted_sum(Tape<T>& tape, Tensor<T> x, const Number* coefficients) {
 // a x + b y, [1, 1], of x and y [1, 1]. Backward: dx += a dz, dy += b dz.
 template <class T>
 Tensor<T> combine(Tape<T>& tape, T a, Tensor<T> x, T b, Tensor<T> y) {
-    const Tensor<T> z = tape.make(1, 1);
-    z.value[0] = a * x.value[0] + b * y.value[0];
-    tape.on_backward(z, [=] {
-        *gradient_of(x) += a * z.grad()[0];
-        *gradient_of(y) += b * z.grad()[0];
+    const auto value = [=](ptrdiff_t) { return a * x.value[0] + b * y.value[0]; };
+    return row_sums(tape, {x, y}, 1, 1, value, [=](ptrdiff_t, T dz) {
+        x.grad()[0] += a * dz;
+        y.grad()[0] += b * dz;
     });
-    return z;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
