@@ -2,7 +2,7 @@
 // antmaze (-v2), WODTEM sec. V-A. One table of tasks, then models, reset, step, observation, reward and termination,
 // written once, as an Environment of memory.hpp.
 //
-// The models are data/*.xml, held in the binary; the mazes are made from their cell maps below. Lengths are in metres,
+// The models are data/*.xml, held in the binary; walls are made from the mazes' cell maps below. Lengths are in metres,
 // times in seconds, angles in radians, and qpos and qvel are MuJoCo's vectors of positions and velocities.
 // Promises: the numbers of the environments that D4RL's data and scores belong to, in either physics; an episode is a
 // function of (seed, episode, actions, machine); a step that the engine warns of is an error, never data.
@@ -183,11 +183,13 @@ WODTEM_EMBED(wodtem_hopper_xml, "data/hopper.xml")
 WODTEM_EMBED(wodtem_walker2d_xml, "data/walker2d.xml")
 WODTEM_EMBED(wodtem_halfcheetah_xml, "data/halfcheetah.xml")
 WODTEM_EMBED(wodtem_ant_xml, "data/ant.xml")
+WODTEM_EMBED(wodtem_maze2d_xml, "data/maze2d.xml")
 
-// data/*.xml; of the mazes only antmaze, whose ant is gym's, has such a file.
+// data/*.xml; antmaze's ant is gym's.
 inline const char* embedded_model(Rules rules) {
     if (rules == Rules::hopper) return wodtem_hopper_xml;
     if (rules == Rules::walker2d) return wodtem_walker2d_xml;
+    if (rules == Rules::maze2d) return wodtem_maze2d_xml;
     return rules == Rules::halfcheetah ? wodtem_halfcheetah_xml : wodtem_ant_xml;
 }
 
@@ -209,40 +211,15 @@ inline std::string maze_walls(const MujocoTask& task) {
     return xml;
 }
 
-// A ball that forces along x and y push over a plane without friction. Radius 0.1, 4.18879 kg, 100 N, no gravity.
-inline std::string maze2d_model(const MujocoTask& task) {
-    return R"(<mujoco model="maze2d">
-  <option timestep="0.01" gravity="0 0 0" iterations="20" integrator="Euler"/>
-  <size njmax="500" nconmax="100"/>
-  <default>
-    <joint type="slide" damping="1"/>
-    <geom condim="1" contype="2" conaffinity="1" friction="0.5 0.1 0.1" margin="0.002" density="1000"/>
-    <motor ctrllimited="true" ctrlrange="-1 1" gear="100"/>
-  </default>
-  <worldbody>
-    <geom type="plane" pos="0 0 -0.1" size="40 40 0.25" contype="1" conaffinity="0" margin="0"/>
-    <body pos="1.2 1.2 0">
-      <joint name="x" axis="1 0 0"/>
-      <joint name="y" axis="0 1 0"/>
-      <geom type="sphere" size="0.1" contype="1"/>
-    </body>)" +
-           maze_walls(task) +
-           R"(</worldbody>
-  <actuator><motor joint="x"/><motor joint="y"/></actuator>
-</mujoco>)";
-}
-
 // The task's MJCF: a file of data/ and what the task or the physics changes in it. Later elements win.
 inline std::string task_model(const MujocoTask& task, Physics physics) {
-    if (task.rules == Rules::maze2d) return maze2d_model(task);  // a ball weighs the same in both physics
     std::string xml = "<mujoco><include file=\"model.xml\"/>";
     if (physics == Physics::mujoco_2_2) xml += R"(<compiler inertiafromgeom="true")";
     if (physics == Physics::mujoco_2_2) xml += task.rules == Rules::halfcheetah ? R"( settotalmass="14"/>)" : "/>";
     if (task.rules == Rules::antmaze)
         xml += R"(<option timestep="0.02"/>
-            <default><geom solref="0.02 1" solimp="0.8 0.8 0.01"/><motor gear="1" ctrlrange="-30 30"/></default>
-            <worldbody>)" +
-               maze_walls(task) + "</worldbody>";
+            <default><geom solref="0.02 1" solimp="0.8 0.8 0.01"/><motor gear="1" ctrlrange="-30 30"/></default>)";
+    if (task.maze) xml += "<worldbody>" + maze_walls(task) + "</worldbody>";
     return xml + "</mujoco>";
 }
 
