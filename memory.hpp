@@ -8,10 +8,7 @@
 // Promises: exact nearest neighbours; every tie has a stated winner, so results depend on the order of updates and
 // look-ups and on nothing else (not on when the search tree was built, not on a save and load in between); a refused
 // trajectory leaves the table as it was; many threads may call search() at once. Leaves out: networks, files.
-//
-// Memory per entry, with projected_dim 4 and action_dim 8: 88 bytes are saved (key 16, projected state 16, action 32,
-// e 8, priority 8, age 8); the hash table, the eviction heap and the search tree are derived from them and take about
-// as much again. The raw state is not kept. Times of a look-up, an insertion and an eviction: tests/BENCH.md.
+// Memory: the columns of EpisodicMemory, and about as much again for what is derived from them. Times: tests/BENCH.md.
 #pragma once
 
 #include <exception>
@@ -658,10 +655,9 @@ struct EpisodicMemory {
 
     // WODTEM sec. IV-B.1, full table: "When Q is filled, we remove the least frequently accessed entry"; ties: the
     // oldest. Returns its number, which goes to the entry that is inserted next.
-    // Accesses do not touch the heap: an item holds the priority its entry had when it was pushed, which is at most
-    // what it has now. So when the smallest item proves up to date, no entry can be below it; when it does not, it goes
-    // back with its present priority. Each access makes at most one item stale: amortised, one push per access. The
-    // item of the entry evicted last, whose successor may be below it, is still on top and goes back first.
+    // Accesses do not touch the heap: an item holds the priority its entry had when it was pushed, which only grows. So
+    // when the smallest item is up to date, none is below it; else it goes back with its present priority: amortised,
+    // one push per access. The item of the entry evicted last, whose successor may be below it, is still on top.
     uint32_t evict() {
         for (uint32_t i = 0; heap.size() < size(); ++i) heap.push(heap_item(i));
         uint32_t entry = std::get<2>(heap.top());
@@ -715,7 +711,6 @@ struct EpisodicMemory {
     // projected s_q `at` [n, dim], each with an entry that is passed over, `skipped` [n]. limit: reach(), the largest
     // distance of a neighbour. Several walks take one step each in turn, so that the next node of a walk can come from
     // memory while the others compute. The K closest of those within epsilon are those within epsilon of the K closest.
-    // The tests hold this to a scan of all entries.
     Neighbourhoods nearest(const std::vector<float>& at, const std::vector<uint32_t>& skipped, float limit) const {
         const size_t n = skipped.size(), K = static_cast<size_t>(config.K);
         Neighbourhoods found{K, std::vector<Neighbour>(n * K), std::vector<size_t>(n)};
@@ -769,10 +764,9 @@ struct EpisodicMemory {
     }
 
     // WODTEM eq. (5): e-hat(s_q) = sum_k p_k e_k, p_k = exp(-q(s_q, s_k)) / sum_k1 exp(-q(s_q, s_k1)).
-    // Returns whether d >= e-hat(s_q), that is whether a_c is "the historical optimal action". The p_k sum to 1, so the
-    // comparison is sum_k exp(-q_k) (e_k - d) <= 0. This form is exact where it matters: if all e_k equal d, each term
-    // is 0, whereas a rounded mean of equal numbers can exceed them and would give such a pair the weight alpha.
-    // Without neighbours the sum is empty and the answer yes: nothing speaks against a_c.
+    // Returns whether d >= e-hat(s_q), that is whether a_c is "the historical optimal action", as
+    // sum_k exp(-q_k) (e_k - d) <= 0: if all e_k equal d each term is 0, whereas a rounded mean of equal numbers can
+    // exceed them. Without neighbours the sum is empty and the answer yes: nothing speaks against a_c.
     bool is_optimal(std::span<const Neighbour> found, double d) const {
         double excess = 0.0;
         for (size_t k = 0; k < found.size(); ++k) excess += similarity(found, k) * (e[found[k].entry] - d);
