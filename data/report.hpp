@@ -491,16 +491,18 @@ inline std::string shown_setting(const Settings& settings, const SettingRow& row
 inline void name_differences(Group& group) {
     for (const SettingRow& setting : setting_rows) {
         if (!identifies(setting)) continue;
-        std::set<std::string> departures;  // of the rows; "": none
+        std::map<std::string, std::string> departures;  // of the rows, how they are shown by their value; "": none
         std::set<size_t> methods_that_depart;
         for (const Row& row : group.rows) {
             const Run& run = row.any();
-            const bool departs = setting_text(run.settings, setting) != setting_text(run.usual, setting);
-            departures.insert(departs ? shown_setting(run.settings, setting) : "");
+            const std::string value = setting_text(run.settings, setting);
+            const bool departs = value != setting_text(run.usual, setting);
+            departures.try_emplace(departs ? value : "", departs ? shown_setting(run.settings, setting) : "");
             if (departs) methods_that_depart.insert(run.method);
         }
         if (departures.size() == 1) {
-            if (!departures.begin()->empty()) group.in_all.rows.push_back({*departures.begin()});
+            if (const std::string& shown = departures.begin()->second; !shown.empty())
+                group.in_all.rows.push_back({shown});
             continue;
         }
         for (Row& row : group.rows)

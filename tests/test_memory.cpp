@@ -630,18 +630,18 @@ TEST(the_tree_survives_any_order_of_coming_and_going) {
 }
 
 TEST(many_equal_points_neither_break_nor_slow_the_tree) {
-    // 50,000 states that differ only in a coordinate the projection does not see; 50,000 more evict all but 10,000.
+    // 20,000 states that differ only in a coordinate the projection does not see; 20,000 more evict all but 5,000.
     EpisodicMemory memory(
-        {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 60000, .K = 2, .epsilon = 1}, 1);
+        {.state_dim = 3, .action_dim = 1, .projected_dim = 2, .capacity = 25000, .K = 2, .epsilon = 1}, 1);
     memory.projection = {1, 0, 0, 0, 1, 0};
-    for (int i = 0; i < 110000; ++i) {
+    for (int i = 0; i < 45000; ++i) {
         const auto x = static_cast<float>(i);
-        const bool elsewhere = i >= 50000 && i < 60000;
+        const bool elsewhere = i >= 20000 && i < 25000;
         memory.update(one_step(elsewhere ? std::vector<float>{x, x * 0.5f, 0} : std::vector<float>{3, 4, x}, 0, 0));
-        if (i != 59999 && i != 109999) continue;
+        if (i != 24999 && i != 44999) continue;
         const float at[] = {3, 4, -1}, near[] = {3.25f, 4, -1};
         const uint32_t oldest = 0;  // slots are given anew from the oldest on, so again to the first
-        for (int j = 0; j < 10000; ++j)
+        for (int j = 0; j < 1000; ++j)
             CHECK(entries_of(search(memory, at)) == (std::vector<uint32_t>{oldest, oldest + 1}));
         CHECK(entries_of(search(memory, near)) == (std::vector<uint32_t>{oldest, oldest + 1}));
         check_tree(memory);

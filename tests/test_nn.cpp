@@ -326,20 +326,18 @@ void pretend(Threads& threads, int count) {
 TEST(matmul_gives_the_same_bits_for_any_number_of_threads) {
     Draws draws = {2};
     for (const Kernel* kernel : kernels_of_this_machine())
-        for (const int threads : {1, 2, 3, 4, 5, 6, 7, 8, 64}) {
+        for (const int threads : {2, 3, 5, 8, 64}) {
             Compute compute(*kernel, threads == 64 ? 1 : threads);
             if (threads == 64) pretend(compute.threads, threads);
-            check_matmul(compute, draws, 109, 3 * kernel->tile_columns + 1,
-                         300);  // many rows; blocks of rows
-            check_matmul(compute, draws, 3, 9 * kernel->tile_columns,
-                         70);  // wide: blocks of columns
+            check_matmul(compute, draws, 109, 3 * kernel->tile_columns + 1, 260);  // many rows; blocks of rows
+            check_matmul(compute, draws, 3, 9 * kernel->tile_columns, 70);         // wide: blocks of columns
             check_matmul(compute, draws, 401, 5, 30);
         }
 }
 
 TEST(matmul_packs_a_frozen_weight_once_and_again_when_frozen_anew) {
     Draws draws = {4};
-    constexpr int M = 70, N = 67, K = 700;
+    constexpr int M = 20, N = 67, K = 300;
     const std::vector<float> a = draws.normals<float>(M * K);
     for (const Kernel* kernel : kernels_of_this_machine())
         for (const bool transposed : {false, true}) {
