@@ -68,18 +68,19 @@ build/tests: $(TESTS:%=build/%.o)
 test: wodtem build/tests
 	build/tests
 
-# -Og and all checks for what reads bytes and draws; -O1 for what computes, there without checks of each pointer, which
-# take a third of the compilation: an access through a null pointer, or outside of an object, AddressSanitizer finds;
-# nothing is virtual. What computes comes first in the link, which keeps the first of equal functions.
+# The link keeps the first of equal functions. First stands what has all checks: the tests of what reads bytes (-Og), and
+# of the memory and the network (-O1). Then what computes besides, without checks of each pointer, which take a third of
+# the compilation: an access through a null pointer, or outside of an object, AddressSanitizer finds; nothing is virtual.
 FEWER_CHECKS = -O1 -fno-sanitize=null,alignment,object-size,vptr
-COMPUTING = test_wodtem test_nn test_memory test_mujoco test_sac test_collect test_waypoints
+COMPUTING = test_wodtem test_mujoco test_sac test_collect test_waypoints
+LINKED_FIRST = test_hdf5 test_data test_memory test_nn $(COMPUTING)
 build/san-%.o: tests/%.cpp wodtem.cpp $(HEADERS) | packages
 	@mkdir -p build
 	$(CXX) $(CXXFLAGS) -Og -fsanitize=address,undefined -fno-sanitize-recover=all $(CHECKS) -c $< -o $@
 $(COMPUTING:%=build/san-%.o): CHECKS = $(FEWER_CHECKS)
 build/san-test_nn.o build/san-test_memory.o: CHECKS = -O1
 
-build/tests-sanitized: $(patsubst %,build/san-%.o,$(COMPUTING) $(filter-out $(COMPUTING),$(TESTS)))
+build/tests-sanitized: $(patsubst %,build/san-%.o,$(LINKED_FIRST) $(filter-out $(LINKED_FIRST),$(TESTS)))
 	$(CXX) $(CXXFLAGS) -fsanitize=address,undefined $^ -o $@ $(LIBRARIES)
 
 build/tests-threads: tests/main.cpp tests/test_nn.cpp tests/test_wodtem.cpp wodtem.cpp $(HEADERS) | packages

@@ -655,9 +655,9 @@ struct EpisodicMemory {
 
     // WODTEM sec. IV-B.1, full table: "When Q is filled, we remove the least frequently accessed entry"; ties: the
     // oldest. Returns its number, which goes to the entry that is inserted next.
-    // Accesses do not touch the heap: an item holds the priority its entry had when it was pushed, which only grows. So
-    // when the smallest item is up to date, none is below it; else it goes back with its present priority: amortised,
-    // one push per access. The item of the entry evicted last, whose successor may be below it, is still on top.
+    // Accesses do not touch the heap: an item holds the priority that its entry had when it was pushed, and a priority
+    // only grows. So when the smallest item is up to date, none is below it; else it goes back with its present
+    // priority: amortised, one push per access. The item of the entry evicted last is still on top and goes back first.
     uint32_t evict() {
         for (uint32_t i = 0; heap.size() < size(); ++i) heap.push(heap_item(i));
         uint32_t entry = std::get<2>(heap.top());

@@ -72,7 +72,7 @@ inline std::vector<MazeCell> cells_marked(std::string_view map, char mark) {
     return cells;
 }
 
-// A map as a grid of cells, which are its characters.
+// A grid of cells: the characters of a map.
 struct MazeGrid {
     std::string_view map;
     int columns = static_cast<int>(map.find('/')), rows = static_cast<int>(map.size()) / (columns + 1);
@@ -185,7 +185,7 @@ WODTEM_EMBED(wodtem_halfcheetah_xml, "data/halfcheetah.xml")
 WODTEM_EMBED(wodtem_ant_xml, "data/ant.xml")
 WODTEM_EMBED(wodtem_maze2d_xml, "data/maze2d.xml")
 
-// data/*.xml; antmaze's ant is gym's.
+// Returns a file of data/*.xml; antmaze has gym's ant.
 inline const char* embedded_model(Rules rules) {
     if (rules == Rules::hopper) return wodtem_hopper_xml;
     if (rules == Rules::walker2d) return wodtem_walker2d_xml;

@@ -522,12 +522,13 @@ void pack_floats(void* to, View<const float> view, int first_k, int first_line, 
     float* const panel = static_cast<float*>(to);
     if (used < Width) std::fill_n(panel, depth * Width, 0.0f);
     if (!view.transposed) {  // the lines lie side by side: copy along them
-        const float* row = &view(first_k, first_line);
-        for (int k = 0; k < depth; ++k, row += view.stride)
-            if (used == Width)
-                std::memcpy(panel + k * Width, row, sizeof(float) * Width);  // of a constant size: a few vectors
+        for (int k = 0; k < depth; ++k) {
+            const float* const row = &view(first_k + k, first_line);
+            if (used == Width)  // the size is constant, so that this is a few vectors
+                std::memcpy(panel + k * Width, row, sizeof(float) * Width);
             else
                 for (int line = 0; line < used; ++line) panel[k * Width + line] = row[line];
+        }
         return;
     }
     for (int first = 0; first < used; first += 4) {  // the lines lie along k: transpose blocks of 4 x 4
@@ -776,8 +777,9 @@ inline void matmul(Compute& compute, View<float> c, View<const float> a, View<co
     // C in tiles, tiles in blocks: of rows, and for a wide C with few rows also of columns, as equal as tiles allow.
     const int tiles = divide_up(M, kernel.tile_rows), panels = divide_up(N, kernel.tile_columns);
     const int fewest = std::max(divide_up(tiles, Compute::block_rows / kernel.tile_rows), serial ? 1 : 4);
-    const int row_blocks = std::min(tiles, divide_up(fewest, threads) * threads);
-    const int column_blocks = std::clamp(std::max(8, 4 * threads) / row_blocks, 1, std::max(1, panels / 4));
+    const int row_blocks = std::min(tiles, serial ? fewest : divide_up(fewest, threads) * threads);
+    const int widest = serial ? 1 : std::max(1, panels / 4);
+    const int column_blocks = std::clamp(std::max(8, 4 * threads) / row_blocks, 1, widest);
 
     PackedWeight* cached = nullptr;
     if (b.weight && compute.weights_frozen) cached = &compute.weights[{b.data, b.stride, b.transposed, K, N}];
@@ -1142,8 +1144,8 @@ Tensor<T> linear(Tape<T>& tape, Tensor<T> x, const Affine<T>& affine, Activation
 }
 
 // to[to_rows[i]] += from[from_rows[i]] for i < count, in this order, rows of d numbers; a null list: rows 0, 1, ...
-// Shared out by columns, since a row may be added to twice. Store::overwrite, for rows that are all different: to what
-// was there nothing is added; it need not have been initialised.
+// Shared out by columns, since a row may be added to twice. With Store::overwrite the rows of `to` must all be
+// different; they are set, and need not have been initialised.
 template <class T>
 void add_rows(Compute& compute, T* to, const int* to_rows, const T* from, const int* from_rows, int count, int d,
               Store store) {
@@ -1167,7 +1169,7 @@ void add_rows_by_index(Tape<T>& tape, Tensor<T> to, const int* to_rows, Tensor<T
     Compute& compute = tape.compute;
     add_rows<T>(compute, to.value, to_rows, from.value, from_rows, count, to.columns, store);
     tape.on_backward(to, [=, &compute] {
-        const bool every_row = !from_rows && count == from.rows;  // once: then no zeros are needed
+        const bool every_row = !from_rows && count == from.rows;  // each is added to once, so it needs no zeros first
         const Store store_from = every_row ? next_store(from) : Store::accumulate;
         T* const d_from = every_row ? from.grad() : gradient_of(from);
         add_rows<T>(compute, d_from, from_rows, to.grad(), to_rows, count, to.columns, store_from);
@@ -1995,7 +1997,7 @@ Tensor<T> categorical_log_prob(Tape<T>& tape, Tensor<T> log_p, const float* acti
 // H = -sum p log p of each row, exact, in nats. log_p [n, moves]. The derivative by log p is -p (log p + 1).
 template <class T>
 Tensor<T> categorical_entropy(Tape<T>& tape, Tensor<T> log_p) {
-    T* const p = tape.template scratch<T>(log_p.size());
+    T* const p = tape.template scratch<T>(log_p.size());  // [n, moves] exp(log p), for the backward pass too
     const auto value = [=](ptrdiff_t i) {
         p[i] = std::exp(log_p.value[i]);
         return -p[i] * log_p.value[i];
@@ -2160,7 +2162,7 @@ bool adam_step(float* __restrict gradient, float* __restrict m, float* __restric
             bad = any;
         });
     };
-    // From update 16,628 on, if beta2 is 0.999, the correction is 1: one slow division less.
+    // From update 16,628 on, if beta2 is 0.999, the correction is 1, and a slow division is saved.
     root_bias2 == 1.0f ? run(std::true_type{}) : run(std::false_type{});
     return bad != 0;
 }
@@ -2192,8 +2194,8 @@ double gradient_norm(Compute& compute, const std::vector<Parameter<T>>& paramete
 }
 
 // One update of all parameters from their gradients; returns the gradient's norm before clipping. Gradients are 0 after
-// it. A trust ratio takes a second pass over a tensor, because the norm of the whole step decides how far each weight
-// goes: moments and step first, the step written over the gradient, then the weights.
+// it. A trust ratio takes three more passes over a tensor, because the norm of the whole step decides how far each
+// weight goes: two for the norms of weights and step, which is written over the gradient, and one for the weights.
 // LAMB as ODT has it: the trust ratio |theta| / |u| of each tensor (Q, K, V are one) has no bound, is 1 where either
 // norm is 0, and is left out at weight decay 0 unless always_adapt. Errors: nn.not_finite names the tensor, before
 // anything is changed (gradient), or after (value).

@@ -237,7 +237,7 @@ Batch batch_of(const Agent& agent, const std::vector<Trajectory>& trajectories, 
     size_t n = 0, i = 0;
     for (const Window& window : windows) {
         n += batch.sequences.lengths.emplace_back(window.length);
-        // The data lie anywhere in memory: fetched now, all windows' come at the same time.
+        // The data lie anywhere in memory. Fetched now, those of all windows arrive at the same time.
         const Trajectory& trajectory = trajectories[window.trajectory];
         __builtin_prefetch(&trajectory.states[window.start * agent.spec.state_dim]);
         __builtin_prefetch(&trajectory.actions[window.start * agent.spec.action_dim]);

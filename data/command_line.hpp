@@ -305,7 +305,7 @@ inline void find_data_again(Settings& settings, const std::string& path, const s
 }
 
 // given: a file; "random": none, so ten episodes of random actions and the online phase alone; "": the file of the
-// task's id. Errors: dataset.missing, also where no data set has that name.
+// task's id. Errors: dataset.missing, also where no data set has that name; those of data_set_file().
 inline void choose_data_set(Settings& settings, const std::string& given, const Settings* before) {
     const PublishedDataSet* published = find_published(settings.task);
     if (given.empty() && !published)
@@ -325,7 +325,7 @@ inline void choose_data_set(Settings& settings, const std::string& given, const 
 }
 
 // What own data decide by themselves: sizes, the entropy's bound, and what a return is compared with. Errors: those of
-// load_own_data().
+// data_set_file() and load_own_data().
 inline void choose_own_data(Settings& settings, const std::string& given, const Settings* before = nullptr) {
     take_file(settings, data_set_file(given), before);
     settings.source["dataset"] = "own data";
@@ -444,7 +444,7 @@ inline Settings evaluated_settings(const Arguments& arguments, const TensorFile&
 }
 
 // Of a network to import: with --task those of the command line; else those in the file, for which --dataset alone may
-// be given. Errors: usage.*, settings.*, dataset.other.
+// be given. Errors: usage.*, settings.*, dataset.other; those of data_set_file().
 inline Settings imported_settings(const Arguments& arguments, const TensorFile& file) {
     if (arguments.has("--task")) return settings_of(arguments, arguments["--task"], arguments["--method"]);
     if (!file.metadata.contains("settings"))

@@ -631,25 +631,30 @@ inline size_t rows_in_none(const Rows& rows, const std::vector<Trajectory>& traj
 // Returns a sentence on the first column of observations, or the rewards, whose numbers are nearly one number beside a
 // few far off: 98% of some 10,000 of them lie within a hundredth of their deviation. "": there is none, or few rows.
 inline std::string remark_on_outliers(const Rows& rows) {
-    const size_t stride = rows.count / 10000 + 1;
+    const size_t width = rows.state_dim, stride = rows.count / 10000 + 1;
+    const auto value = [&](size_t row, size_t column) {
+        return column < width ? rows.observation(row)[column] : rows.rewards[row];
+    };
     const double n = static_cast<double>(rows.count);
-    std::vector<double> sample;
-    for (size_t column = 0; column <= static_cast<size_t>(rows.state_dim) && rows.count >= 200; ++column) {
-        const bool reward = column == static_cast<size_t>(rows.state_dim);
-        const auto value = [&](size_t row) { return reward ? rows.rewards[row] : rows.observation(row)[column]; };
-        double sum = 0, squares = 0;
-        for (size_t row = 0; row < rows.count; ++row) sum += value(row);
-        for (size_t row = 0; row < rows.count; ++row) squares += std::pow(value(row) - sum / n, 2);
+    std::vector<double> sums(width + 1), squares(width + 1), sample;
+    for (size_t row = 0; row < rows.count; ++row)
+        for (size_t column = 0; column <= width; ++column) sums[column] += value(row, column);
+    for (size_t row = 0; row < rows.count; ++row)
+        for (size_t column = 0; column <= width; ++column)
+            squares[column] += std::pow(value(row, column) - sums[column] / n, 2);
+    for (size_t column = 0; column <= width && rows.count >= 200; ++column) {
         sample.clear();
-        for (size_t row = 0; row < rows.count; row += stride) sample.push_back(value(row));
+        for (size_t row = 0; row < rows.count; row += stride)
+            if (const double x = value(row, column); std::isfinite(x)) sample.push_back(x);
+        if (sample.empty()) continue;
         std::ranges::sort(sample);
         const double low = sample[sample.size() / 100], high = sample[sample.size() - 1 - sample.size() / 100];
-        if (!(low < high && high - low < 0.01 * std::sqrt(squares / n))) continue;
+        if (!(low < high && high - low < 0.01 * std::sqrt(squares[column] / n))) continue;
         size_t far = 0;
         for (size_t row = 1; row < rows.count; ++row)
-            if (std::fabs(value(row) - low) > std::fabs(value(far) - low)) far = row;
-        return text_of(reward ? "\"rewards\", row " : "\"observations\", row ", far,
-                       reward ? "" : text_of(", column ", column), " is ", value(far),
+            if (std::fabs(value(row, column) - low) > std::fabs(value(far, column) - low)) far = row;
+        return text_of(column < width ? "\"observations\", row " : "\"rewards\", row ", far,
+                       column < width ? text_of(", column ", column) : "", " is ", value(far, column),
                        ", so far from most others that these are nearly one number beside it: is it an error?");
     }
     return "";

@@ -100,7 +100,7 @@ inline void print_tensors(const std::string& path) {
                     shape_text(tensor.shape).c_str(), value_range(file.numbers(tensor)).c_str());
 }
 
-// The command `info`. task: a task's id, or "".
+// The command `info`. task: a task's id, or "". Errors: those of data_set_file() and of reading.
 inline void print_info(const std::string& given, const std::string& task) {
     const std::string path = data_set_file(given);
     if (is_hdf5(path))

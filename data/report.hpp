@@ -491,7 +491,7 @@ inline std::string shown_setting(const Settings& settings, const SettingRow& row
 inline void name_differences(Group& group) {
     for (const SettingRow& setting : setting_rows) {
         if (!identifies(setting)) continue;
-        std::map<std::string, std::string> departures;  // of the rows, how they are shown by their value; "": none
+        std::map<std::string, std::string> departures;  // of the rows: how each value is shown; "": none
         std::set<size_t> methods_that_depart;
         for (const Row& row : group.rows) {
             const Run& run = row.any();
@@ -713,7 +713,8 @@ inline Figure maze_map(const Group& group, const Row& row, const Run& run) {
 
 inline long unfinished(const Runs& runs) { return std::ranges::count(runs, false, &Run::finished); }
 
-// "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher"; ours agrees if it differs by at most paper.deviation.
+// "WODTEM 5.50 ± 0.71, paper 5 (sec. V-D), ours is higher", or "ODT 0.1250" where the paper has no result; ours agrees
+// if it differs by at most the paper's deviation.
 inline std::string compared(const Row& row, const Group& group) {
     const Moments ours = over_seeds(row.runs, final_value, group.quantity);
     std::string out = row.label();

@@ -340,8 +340,9 @@ inline void remove_file(const std::string& path) {
     require(!problem, "run.folder", "cannot remove ", path, ": ", problem.message());
 }
 
-// Makes a folder, if it is not there, and keeps other processes out of it for as long as this lives; the system releases
-// the lock however the process ends. A folder that it made and that stayed empty, after a refused start, goes again.
+// Makes a folder, if it is not there, and keeps other processes out of it for as long as this lives; the system
+// releases the lock however the process ends. A folder that it made and that stayed empty, after a refused start, goes
+// again.
 // Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
 struct FolderLock : File {
     bool made;

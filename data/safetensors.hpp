@@ -436,6 +436,7 @@ struct TensorFile {
         const std::string_view from = bytes(tensor);
         const auto all = [&](auto stored, const auto& value) {
             std::vector<Number> out;
+            out.reserve(from.size() / sizeof stored);
             for (size_t at = 0; at < from.size(); at += sizeof stored) {
                 std::memcpy(&stored, &from[at], sizeof stored);
                 out.push_back(static_cast<Number>(value(stored)));

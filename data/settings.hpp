@@ -9,7 +9,8 @@
 //
 // Promises: what is written reads back as the same settings; what is not in the table, out of its range or missing is
 // an error that names the line, the setting and the nearest value. Leaves out: the command line (command_line.hpp).
-// In order: text, means and deviations, which all of data/ uses; the tables; settings by name, as text, as parts.
+// The file has first what all of data/ uses, text, means and deviations; then the tables; then settings by name, as
+// text and as parts.
 // The other headers of data/ that include this one have what it includes.
 #pragma once
 
@@ -146,7 +147,7 @@ int index_of(const std::array<const char*, N>& names, const std::string& name) {
 // ---------------------------------------------------------------------------------------------------------------------
 // Means and deviations.
 
-// Of the numbers that were added. Mean and deviation of none are NaN, and so is the sample's deviation of one.
+// Of the numbers that were added. The mean and both deviations of none are NaN, as is the sample's deviation of one.
 struct Moments {
     double count = 0, sum = 0, squares = 0, low = INFINITY, high = -INFINITY;  // squares: of distances from the mean
     void add(double x) {
@@ -159,7 +160,7 @@ struct Moments {
     }
     double mean() const { return sum / count; }
     double deviation() const { return std::sqrt(squares / count); }  // of the numbers as they are, as D4RL's statistics
-    double sample_deviation() const { return std::sqrt(squares / (count - 1)); }
+    double sample_deviation() const { return count > 1 ? std::sqrt(squares / (count - 1)) : NAN; }
     std::string text() const {
         if (count == 0) return "none";
         char line[160];

@@ -140,7 +140,7 @@ void dump_update(Run& run, const std::string& path) {
                 static_cast<unsigned long long>(run.progress.updates + 1), dump.file.tensors.size());
 }
 
-// Errors: dump.weights, file.input; those of the data set.
+// Errors: dump.weights, dump.dataset, file.input; those of the data set.
 void dump_run(const std::string& path, RunFolder folder, const Arguments& arguments) {
     Settings settings = settings_from_text(read_file(folder.file("settings"), 1 << 20), folder.file("settings"));
     const bool resumes = folder.has("checkpoint.safetensors");

@@ -1,5 +1,5 @@
-// plain.hpp: definitions told plainly, which the fast or exact forms that training runs are held to: products of
-// matrices, attention, e-hat. Included by the tests and by `wodtem check`, which also computes in double, with these.
+// plain.hpp: plain definitions of products of matrices, of attention and of e-hat. The tests hold to them the fast or exact
+// forms, which training runs; `wodtem check`, which also computes in double, does so with these.
 #pragma once
 
 #include "../memory.hpp"

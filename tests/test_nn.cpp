@@ -1328,16 +1328,19 @@ struct PlainOptimizer {
     }
 };
 
-void check_optimizer(const OptimizerConfig& config, double gradient_scale) {
+// before: how many updates count as made, with moments of 0.
+void check_optimizer(const OptimizerConfig& config, double gradient_scale, int before = 0) {
     Draws draws = {18};
     std::vector<Parameter<float>> parameters = some_parameters(draws);
     PlainOptimizer plain(parameters);
+    plain.t = before;
     Optimizer optimizer;
+    optimizer.updates = static_cast<uint64_t>(before);
     for (int step = 1; step <= 8; ++step) {
         draw_gradients(draws, parameters, gradient_scale);
         const double norm = plain.step(parameters, config);
         CHECK_CLOSE(update_parameters(serial(), parameters, optimizer, config), norm, 1e-12 * norm);
-        CHECK_EQUAL(optimizer.updates, static_cast<uint64_t>(step));
+        CHECK_EQUAL(optimizer.updates, static_cast<uint64_t>(before + step));
         for (size_t p = 0; p < parameters.size(); ++p)
             for (size_t i = 0; i < parameters[p].value.size(); ++i) {
                 // A moment: 4 roundings a step, of numbers below 6 scales. A value: 2 of itself, and those of u, below
@@ -1370,6 +1373,8 @@ TEST(optimizers_equal_plain_ones_in_double) {
             config.clip_norm = 0;
             config.warmup_updates = 0;
             check_optimizer(config, gradient_scale);
+            for (const int before : {400, 16624})  // the second bias correction is near 1, and becomes 1
+                check_optimizer(config, gradient_scale, before);
         }
 }
 

@@ -1762,7 +1762,7 @@ def step():
 
 # ----------------------------------------------------------------------------------------------------------------------
 # env_TASK: gym's and D4RL's rules around MuJoCo's own library, which a few lines of C open to Python. The robots'
-# models are data/*.xml (the tests hold every number of them against tables); mazes are written here from their maps.
+# models are data/*.xml but for maze2d's (the tests hold every number of them against tables); mazes are written here from their maps.
 
 SHIM = r"""
 #include <mujoco/mujoco.h>
