@@ -1,19 +1,18 @@
 #!/usr/bin/env bash
 # ml_dtypes: NumPy's sum, mean and deviation of bfloat16 stop growing at 256 ones; one NaN leaves np.sort unsorted.
 #
-# Expected: as for NumPy's own float16: sums are formed in a wider type, so the mean of 1,000 ones is 1; np.sort puts NaN
-#           last and the numbers in order.
+# Expected: as for NumPy's own float16: sums are formed in a wider type, so the mean of 1,000 ones is 1; np.sort puts
+#           NaN last and the numbers in order.
 # Seen:     sums are formed in bfloat16, which has 8 bits: from 256 on, adding 1 changes nothing. The mean of 1,000 ones
 #           is 0.256, their deviation 0.504, the mean of 100,000 numbers around 5 is 0.041; there is no message. A dot
 #           product and linalg.norm of the same ones are right, because they are formed in float32 and double. Sorting
 #           five numbers of which the third is NaN leaves 1 3 nan 0 2, and np.unique keeps equal numbers twice: every
 #           comparison with NaN is false, and the type has no order of its own that puts it last.
-# Versions: ml_dtypes 0.6.0, numpy 2.4.6; CPython 3.11, x86-64 Linux. Seen on 2026-12-01. The project's issue 63 is about
-#           the mean.
-# Matters:  ml_dtypes is how JAX, safetensors.numpy and TensorFlow hand bfloat16 to NumPy. Whoever checks a dump of bf16
-#           weights, activations or states by mean and deviation, or normalises states by them, gets numbers that are
-#           wrong by a factor of 100, the more wrong the more rows; a median or quantile of a dump that holds a NaN may
-#           be any of its numbers.
+# Versions: ml_dtypes 0.6.0, numpy 2.4.6; CPython 3.11, x86-64 Linux. Seen on 2026-12-01. Issue 63 of ml_dtypes is
+#           about the mean.
+# Matters:  ml_dtypes is how JAX hands bfloat16 to NumPy. Whoever checks a dump of bf16 weights, activations or states
+#           by mean and deviation, or normalises states by them, gets numbers that are wrong by a factor of 100, the
+#           more wrong the more rows; what sorting is for, ranks and quantiles by hand, fails if the dump holds a NaN.
 # Way out:  .astype(numpy.float32) first, or dtype=numpy.float32 in sum, mean and std.
 set -eu
 
@@ -59,7 +58,7 @@ print("Sorting 3 1 nan 2 0:")
 some = np.array([3, 1, np.nan, 2, 0])
 check("in bfloat16", np.sort(some.astype(bfloat16)).astype(np.float32), [1, 3, np.nan, 0, 2])
 check("in float16", np.sort(some.astype(np.float16)).astype(np.float32), [0, 1, 2, 3, np.nan])
-check("unique of 1 nan 1 nan 2 in bfloat16", np.unique(np.array([1, np.nan, 1, np.nan, 2], bfloat16)).astype(np.float32),
-      [1, np.nan, 1, np.nan, 2])
+twice = np.array([1, np.nan, 1, np.nan, 2], bfloat16)
+check("unique of 1 nan 1 nan 2 in bfloat16", np.unique(twice).astype(np.float32), [1, np.nan, 1, np.nan, 2])
 PYTHON
 echo "Confirmed: bfloat16 sums saturate in NumPy, and a NaN leaves a sorted array unsorted."
