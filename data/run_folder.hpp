@@ -80,16 +80,22 @@ inline double length_of_shift(const std::vector<double>& shift, bool discrete) {
 // sum is the share of the loss that is advice. Beside it are summed the shift advice (a-hat - a), in which opposite
 // shifts cancel, and the length of each step's shift. a, a_hat: [action_dim].
 inline void add_advice(Tally& tally, const EnvironmentSpec& spec, double advice, const float* a, const float* a_hat) {
-    const bool discrete = spec.discrete_actions > 0;
-    std::vector<double> shift(discrete ? spec.discrete_actions : spec.action_dim);
-    tally.advice_shift.resize(shift.size());
-    for (size_t j = 0; j < shift.size(); ++j) {
-        const float move = static_cast<float>(j);
-        shift[j] = advice * (discrete ? (*a_hat == move) - (*a == move) : double{a_hat[j]} - double{a[j]});
-        tally.advice_shift[j] += shift[j];
-    }
     tally.advice += advice;
-    tally.advice_distance += length_of_shift(shift, discrete);
+    if (spec.discrete_actions > 0) {
+        tally.advice_shift.resize(spec.discrete_actions);
+        tally.advice_shift[static_cast<size_t>(*a_hat)] += advice;
+        tally.advice_shift[static_cast<size_t>(*a)] -= advice;
+        tally.advice_distance += *a_hat == *a ? 0 : advice;
+        return;
+    }
+    tally.advice_shift.resize(spec.action_dim);
+    double squares = 0;
+    for (size_t j = 0; j < tally.advice_shift.size(); ++j) {
+        const double shift = advice * (static_cast<double>(a_hat[j]) - static_cast<double>(a[j]));
+        tally.advice_shift[j] += shift;
+        squares += shift * shift;
+    }
+    tally.advice_distance += std::sqrt(squares);
 }
 
 struct ProgressRow {
@@ -342,8 +348,7 @@ inline void remove_file(const std::string& path) {
 
 // Makes a folder, if it is not there, and keeps other processes out of it for as long as this lives; the system
 // releases the lock however the process ends. A folder that it made and that stayed empty, after a refused start, goes
-// again.
-// Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
+// again. Errors: run.busy, run.folder. A file system that has no locks is reported on stderr, and the run goes on.
 struct FolderLock : File {
     bool made;
 
