@@ -723,8 +723,8 @@ struct Hdf5Parser {
     Cursor continuation(Cursor message, bool old) {
         const auto [address, length] = message.fields(8, 8);
         Cursor block = cursor(address, length);
-        if (old) return block;
         block.expect(length >= 8, "a continuation block of at least 8 bytes");
+        if (old) return block;
         block.signature("OCHK");
         return block.checked(length - 8);
     }
@@ -1092,6 +1092,7 @@ struct Hdf5Parser {
             Cursor base = c;
             if ((base.number(1) & 15) != 0) return;
             datatype(d, c);
+            c.expect(d.element.size == size, "an enumeration of the size of its integers");
             c.take(12);  // the integer type
             const Bytes names = c.take(std::min<uint64_t>(6, c.end - c.at));
             const bool boolean = flags == 2 && size == 1 && std::ranges::equal(names, as_bytes({"FALSE", 6}));
@@ -1158,6 +1159,7 @@ struct Hdf5Parser {
         g.chunk_bytes = total;
         const auto [elsewhere, size] = c.fields(kind == 0 ? 0 : 8, kind == 0 ? 2 : 8);
         const uint64_t address = kind == 0 ? c.at : elsewhere;
+        c.expect(kind != 0 || size <= c.end - c.at, "compact data within their message");
         if (total == 0 || address == undefined_address) return;
         c.expect(size >= total, std::to_string(total) + " bytes of data");
         add(g, {address, total}, c.start);

@@ -3,8 +3,10 @@
 #include <sys/resource.h>
 #include <sys/wait.h>
 
+#include <chrono>
 #include <csignal>
 #include <filesystem>
+#include <fstream>
 
 #include "../data/hdf5.hpp"
 #include "test.hpp"
@@ -627,8 +629,8 @@ TEST(hdf5_circles_end_in_errors) {
     set_u64(circle, root + 32, 24);
     CHECK_FAILS("hdf5.cycle", parse(circle));
     circle = bytes;
-    circle[tree + 5] = 1;  // a node that is its own child
-    set_u64(circle, tree + 32, tree);
+    circle[tree + 5] = 2;  // its child, the node of "g", would have to have level 1
+    set_u64(circle, tree + 32, u64(bytes, leaf + 32));
     CHECK_FAILS("hdf5.format", parse(circle));
     CHECK_FAILS("hdf5.format", parse(std::string(5000, 'x')));
     CHECK_FAILS("hdf5.format", parse(""));
@@ -694,4 +696,129 @@ TEST(hdf5_sizes_out_of_proportion_are_refused) {
         set_u64(damaged, shape, rows);
         CHECK_FAILS(rows == 4 ? "hdf5.format" : "hdf5.too_large", parse(damaged));
     }
+}
+
+// Kinds of faults that were published of the HDF5 library (ROBUSTNESS.md), one file each: in a file of tests/hdf5 the
+// bytes that lie `skip` after the first place of the letters are replaced. HDF5 2.0.0 itself refuses or reads each.
+namespace {
+
+struct Fault {
+    std::string kind;
+    std::string_view letters;
+    int skip;
+    std::string_view bytes;
+    std::string said;  // a part of the message
+};
+
+using namespace std::string_view_literals;
+const std::map<std::string, std::vector<Fault>> published_faults = {
+    {"small_old",
+     {{"superblock: addresses of 255 bytes", "\x89HDF"sv, 13, "\xFF"sv, "offsets and lengths of 8 bytes"},
+      {"superblock: an end beyond the file", "\x89HDF"sv, 44, "\1"sv, "its superblock says 42949"},
+      {"header: a message longer than its block", "\3\1\x33\x10"sv, 26, "\0\2"sv, "a message within its block"},
+      {"header: a message flagged as shared", "\3\1\x33\x10"sv, -4, "\2"sv, "its layout is shared with other objects"},
+      {"space: 255 dimensions", "\1\1\1\0\0\0\0\0\4"sv, 1, "\xFF"sv, "up to 32 dimensions"},
+      {"space: more dimensions than fit", "\1\1\1\0\0\0\0\0\4"sv, 1, "\x20"sv, "8 bytes before"},
+      {"space: a product of extents that overflows", "\5\0\0\0\0\0\0\0\3"sv, 4,
+       "\2\0\0\0\3\0\0\0\2\0\0\0\5\0\0\0\2\0\0\0\3\0\0\0\2"sv, "a size of at most 64 bits"},
+      {"space: gigabytes in a small file", "\1\1\1\0\0\0\0\0\4"sv, 12, "\2\0\0\0\4\0\0\0\2"sv, "in a file so small"},
+      {"space: an extent above its limit", "\1\1\1\0\0\0\0\0\4"sv, 8, "\5"sv, "not above the largest allowed"},
+      {"type: elements of 0 bytes", "\x11\x20\x3F\0"sv, 4, "\0"sv, "a data type of version 1 to 5"},
+      {"type: longer than its message", "\3\0\x18\0\1\0\0\0\x11\x20\x3F\0"sv, 2,
+       "\x08\0\1\0\0\0\x11\x20\x3F\0\x08\0\0\0\0\0\x08\0\0\0\0\0"sv, "12 bytes before"},
+      {"type: more bits than its bytes have", "\x10\x08\0\0\2\0\0\0\0\0\x10"sv, 10, "\xFF"sv, "of type class 0"},
+      {"type: enumerations larger than integers", "\x18\2\0\0\1"sv, 4, "\2"sv, "of the size of its integers"},
+      {"type: an enumeration of enumerations", "\x18\2\0\0\1"sv, 8, "\x18"sv, "elements of type class 8"},
+      {"fill value: longer than its message", "\2\2\2\1\0\0\0\0\x08\0\x18\0\0\0\0\0\3\1\x33"sv, 4, "\x08"sv,
+       "8 bytes before"},
+      {"fill value: larger than an element", "\2\2\2\1\0\0\0\0\x08\0\x18\0\0\0\0\0\3\1\x33"sv, 4, "\x20"sv,
+       "a fill value of the data's type"},
+      {"filters: 255", "\1\3\0\0\0\0\0\0\2\0"sv, 1, "\xFF"sv, "a list of up to 32 filters"},
+      {"filters: more than fit", "\1\3\0\0\0\0\0\0\2\0"sv, 1, "\x20"sv, "2 bytes before"},
+      {"filters: more parameters than fit", "\1\1\0\0\0\0\0\0\1\0"sv, 14, "\xFF\xFF"sv, "262144 bytes before"},
+      {"chunk: shorter than its extents", "TREE\1\0\3"sv, 24, "\4"sv, "a chunk of another size than the others"},
+      {"chunk: between two places", "TREE\1\0\3"sv, 32, "\1"sv, "begins at a multiple of its extents"},
+      {"chunks: of fewer dimensions than the data", "\3\2\2\x70\x33"sv, 2, "\1"sv, "as many dimensions as the data"},
+      {"chunks: of 0 elements", "\3\2\2\x70\x33"sv, 11, "\0"sv, "chunks that are not empty"},
+      {"chunks: a size that overflows", "\3\2\3\x78\5"sv, 11, "\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF"sv,
+       "a size of at most 64 bits"},
+      {"compact data: longer than their message", "\3\0\x18\0\0\0\0\0\0\0\x94"sv, 2, "\xFF\xFF"sv,
+       "compact data within their message"},
+      {"compact data: shorter than the extents", "\3\0\x18\0\0\0\0\0\0\0\x94"sv, 2, "\4"sv, "24 bytes of data"},
+      {"contiguous data: shorter than the extents", "\3\1\x33\x10"sv, 10, "\4"sv, "32 bytes of data"},
+      {"contiguous data: beyond the end", "\3\1\x33\x10"sv, 2, "\xF0\xFF\xFF\xFF\xFF\xFF\xFF\xFF"sv,
+       "the file ends at"},
+      {"symbol node: more entries than fit", "SNOD"sv, 6, "\xFF\xFF"sv, "a text within the heap"},
+      {"symbol node: a name outside of the heap", "SNOD"sv, 10, "\1"sv, "a text within the heap"},
+      {"local heap: a name that does not end", "HEAP"sv, 8, "\x2C"sv, "a text that ends"},
+      {"local heap: longer than the file", "HEAP"sv, 13, "\1"sv, "the file ends at"},
+      {"B-tree 1: a child of another level", "TREE"sv, 5,
+       "\2\1\0\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\xFF\0\0\0\0\0\0\0\0\xD8\x17"sv,
+       "a node one level below the last"},
+      {"B-tree 1: more children than fit", "TREE"sv, 6, "\xFF\xFF"sv, "the signature SNOD"}}},
+    {"small_latest",
+     {{"superblock: a root group beyond the end", "\x89HDF"sv, 43, "\x40"sv, "the file ends at"},
+      {"header: a block beyond the end", "OHDR\2\1"sv, 6, "\xFF\xFF"sv, "65535 bytes before 8667"},
+      {"header: a continuation of 0 bytes", "\x10\x10\0\0\x74"sv, 12, "\0"sv, "a continuation block of at least 8"},
+      {"link: a name longer than its message", "\1\0\1\x61"sv, 2, "\xFF"sv, "255 bytes before"},
+      {"link information: longer than its message", "\2\x12\0\0\0\0\xF7"sv, 5, "\1"sv, "8 bytes before"},
+      {"fractal heap: blocks of 0 bytes", "FRHP"sv, 112, "\0\0"sv, "a doubling table of powers of two"},
+      {"fractal heap: a link outside of its blocks", "BTLF\0\5"sv, 11, "\xFF\xFF"sv, "a link within a block"},
+      {"B-tree 2: records larger than a node", "BTHD\0\5"sv, 10, "\x58\2"sv, "room for records in a node"},
+      {"B-tree 2: 65535 levels", "BTHD\0\5"sv, 12, "\xFF\xFF"sv, "room for records in a node"},
+      {"fixed array: 2^62 chunks", "FAHD\0\0"sv, 15, "\x40"sv, "bytes before 8667"},
+      {"fixed array: pages of 2^255 chunks", "FAHD\0\0"sv, 7, "\xFF"sv, "pages below 2^64 entries"},
+      {"extensible array: 2^255 chunks", "EAHD"sv, 7, "\xFF"sv, "an index of at most 2^48 chunks"},
+      {"extensible array: blocks of 0 chunks", "EAHD"sv, 9, "\0"sv, "an index of at most 2^48 chunks"}}},
+    {"root_old",
+     {{"header: a continuation beyond the end", "\x10\0\x10\0"sv, 12, "\1"sv, "the file ends at"},
+      {"header: an old continuation of 0 bytes", "\x10\0\x10\0"sv, 16, "\0\0"sv, "a continuation block of at least 8"},
+      {"header: a continuation of itself", "\x10\0\x10\0"sv, 8, "\x70\0\0\0\0\0\0\0\x18\0"sv, "in a circle"},
+      {"attribute: a name longer than its message", "\1\0\x0F\0\x0C"sv, 3, "\1"sv, "272 bytes before"},
+      {"attribute: a name that does not end", "total_episodes"sv, 14, "x"sv, "a text that ends"}}}};
+
+// Reads all numbers there are. Returns the message of the first error, or nothing.
+std::string refusal(const std::string& bytes) {
+    try {
+        const Hdf5File file = parse(bytes);
+        for (const Hdf5Dataset& dataset : file.datasets)
+            if (dataset.element.kind != Hdf5Element::text) file.read<double>(dataset);
+        return "";
+    } catch (const Error& error) {
+        return error.what();
+    }
+}
+
+// Kilobytes of memory that this process has (VmRSS), or had at most (VmHWM) since `5` was written to clear_refs.
+long kilobytes(const std::string& which) {
+    std::ifstream status("/proc/self/status");
+    for (std::string word; status >> word;)
+        if (word == which + ":") return status >> word, std::stol(word);
+    return -1;
+}
+
+}  // namespace
+
+TEST(hdf5_faults_published_of_the_library_are_refused_in_time_and_memory) {
+    for (const auto& [name, faults] : published_faults) {
+        const std::string whole = fixture(name);
+        const auto structures = checksummed(whole);
+        CHECK_EQUAL(refusal(whole), "");
+        for (const auto& [kind, letters, skip, bytes, said] : faults) {
+            std::string damaged = whole;
+            damaged.replace(whole.find(letters) + static_cast<size_t>(skip), bytes.size(), bytes);
+            seal(damaged, structures);
+            std::ofstream("/proc/self/clear_refs") << 5;
+            const long before = kilobytes("VmRSS");
+            const auto start = std::chrono::steady_clock::now();
+            const std::string message = refusal(damaged);
+            const std::chrono::duration<double> seconds = std::chrono::steady_clock::now() - start;
+            const long taken = kilobytes("VmHWM") - before;
+            if (message.find(said) == std::string::npos || seconds.count() > 1 || taken > 64 << 10)
+                report_failure(__FILE__, __LINE__,
+                               text_of(kind, ": ", seconds.count(), " s, ", taken, " kB: ", message));
+        }
+    }
+    // The function alone: a file with so short a chunk could harm other readers.
+    CHECK_FAILS("hdf5.checksum", Hdf5File::without_checksum(as_bytes(fixture("small_old")).first(3)));
 }
