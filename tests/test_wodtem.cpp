@@ -2757,6 +2757,11 @@ TEST(inputs_of_the_fuzz_targets_end_in_a_value_or_an_error) {
     for (const char* file : {"settings", "progress.csv", "episodes.csv", "policy.csv", "start_actions.csv"})
         report += read_file(scratch / ("run/" + std::string(file))) + '\0';
     for (const char* target : {"safetensors", "model", "import"}) inputs.emplace_back(target, model);
+    for (const char* name : {"root_old", "root_latest", "shared", "peers_latest"}) {  // the size, then a zlib stream
+        const std::string packed = read_file("tests/hdf5/" + std::string(name) + ".z");
+        inputs.emplace_back("hdf5",
+                            inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8))));
+    }
     inputs.emplace_back("checkpoint", checkpoint);
     inputs.emplace_back("report", report);
     inputs.emplace_back("settings", settings_text(settings));
@@ -2777,7 +2782,7 @@ TEST(inputs_of_the_fuzz_targets_end_in_a_value_or_an_error) {
             } catch (const std::exception& other) {
                 report_failure(__FILE__, __LINE__, target + ", change " + std::to_string(change) + ": " + other.what());
             }
-            if (change == 0) CHECK_EQUAL(id, "");
+            if (change == 0 && target != "hdf5") CHECK_EQUAL(id, "");  // those hold more than a data set, or less
         }
     }
     fs::remove_all(fuzz::scratch());
