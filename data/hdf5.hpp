@@ -575,6 +575,7 @@ inline bool has_superblock(const std::string& path) {
 struct Hdf5Parser {
     Hdf5File& file;
     size_t budget = 16 * file.bytes.size() + (1 << 21);
+    uint64_t promised = 0;                                      // bytes of all data sets so far, read as floats
     std::string object = "superblock";                          // being read, for messages
     std::map<uint64_t, std::string> groups = {};                // visited: address -> path
     std::deque<std::pair<std::string, uint64_t>> objects = {};  // to visit: path, address
@@ -1152,7 +1153,9 @@ struct Hdf5Parser {
             g.unsupported += repack_advice;
             return;
         }
-        const uint64_t total = bounded(g.elements, g.element.size, c);
+        const uint64_t total = product(g.elements, g.element.size, c.at);
+        const uint64_t as_floats = product(g.elements, std::max<uint64_t>(g.element.size, sizeof(float)), c.at);
+        promised = bounded(promised + bounded(as_floats, c), c);
         if (kind == 2) return chunked(g, c, version);
         g.filters.clear();
         g.chunk = g.shape;
@@ -1165,13 +1168,13 @@ struct Hdf5Parser {
         add(g, {address, total}, c.start);
     }
 
-    // Returns count * size, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are
-    // all fill value take nothing. Errors: hdf5.too_large.
-    uint64_t bounded(uint64_t count, uint64_t size, const Cursor& c) const {
-        const uint64_t limit = std::min<uint64_t>(uint64_t{1} << 34, 1040 * file.bytes.size() + (1 << 26));
-        const uint64_t total = product(count, size, c.at);
-        c.expect(total <= limit, "at most " + std::to_string(limit) + " bytes in a file so small", "hdf5.too_large");
-        return total;
+    // Returns `bytes`, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are all
+    // fill value take nothing. Errors: hdf5.too_large.
+    uint64_t bounded(uint64_t bytes, const Cursor& c) const {
+        const uint64_t stored = file.bytes.size(), most = uint64_t{1} << 34;
+        const uint64_t limit = std::max(4 * stored, std::min(most, 1040 * stored + (1 << 26)));
+        c.expect(bytes <= limit, "at most " + std::to_string(limit) + " bytes in a file so small", "hdf5.too_large");
+        return bytes;
     }
 
     // The indexes of chunks (SPEC VII; III.A.1, node type 1; III.A.2, types 10 and 11).
@@ -1191,7 +1194,7 @@ struct Hdf5Parser {
             g.all = g.elements == 0 ? 0 : product(g.all, g.counts[k], c.at);
         }
         c.expect(c.number(width) == g.element.size, "chunks of the data's elements");
-        bounded(g.all, g.chunk_bytes, c);
+        bounded(product(g.all, g.chunk_bytes, c.at), c);
         g.whole_edges = (flags & 1) != 0;
         if (g.elements == 0) return;
         if (version == 3 && tree == undefined_address) return;

@@ -687,14 +687,31 @@ TEST(hdf5_sizes_out_of_proportion_are_refused) {
     {
         Hdf5Writer out(path);
         out.add("x", {3, 1}, std::array{1.0f, 2.0f, 3.0f});
+        out.add("y", {5, 1}, std::vector<uint8_t>(5));
         out.close();
     }
     const std::string bytes = read_file(path);
-    const size_t shape = bytes.find(std::string("\3\0\0\0\0\0\0\0\1\0\0\0\0\0\0\0", 16));
+    const size_t x = bytes.find(std::string("\3\0\0\0\0\0\0\0\1\0\0\0\0\0\0\0", 16));
+    const size_t y = bytes.find(std::string("\5\0\0\0\0\0\0\0\1\0\0\0\0\0\0\0", 16));
     for (const uint64_t rows : {uint64_t{4}, uint64_t{1} << 25, uint64_t{1} << 32, uint64_t{1} << 62, ~uint64_t{0}}) {
         std::string damaged = bytes;
-        set_u64(damaged, shape, rows);
+        set_u64(damaged, x, rows);
         CHECK_FAILS(rows == 4 ? "hdf5.format" : "hdf5.too_large", parse(damaged));
+    }
+    // Data that were never written need no bytes of the file. All data sets count, a byte as the float that it becomes.
+    std::string unwritten = bytes;
+    for (const auto& [name, shape] : {std::pair("x", x), {"y", y}}) {
+        const uint64_t address = parse(bytes).find(name)->chunks[0].address;
+        set_u64(unwritten, bytes.find(std::string(reinterpret_cast<const char*>(&address), 8), shape), ~uint64_t{0});
+    }
+    const uint64_t half = uint64_t{1} << 23;  // rows of 4 bytes, of 2^26 bytes
+    for (const auto& [rows_of_x, rows_of_y] : {std::pair(half, half), {2 * half, half}, {3, 3 * half}}) {
+        set_u64(unwritten, x, rows_of_x);
+        set_u64(unwritten, y, rows_of_y);
+        if (rows_of_x == half)
+            CHECK_EQUAL(parse(unwritten).find("y")->elements, half);
+        else
+            CHECK_FAILS("hdf5.too_large", parse(unwritten));
     }
 }
 
