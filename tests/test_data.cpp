@@ -124,7 +124,7 @@ TEST(safetensors_written_by_hand_is_read) {
     // As others write it: no checksums, other order than the data, white space, escapes.
     const std::string header = "{ \"b\\u00e9\\n\" :" + entry("U8", "[ 2 ]", "[4, 6]") +
                                ",\n\"a\":" + entry("F32", "[]", "[0,4]") +
-                               ",\"__metadata__\":{\"k\":\"\\\"\\\\\\/\\u20AC\"}}   ";
+                               ",\"__metadata__\":{\"k\":\"\\\"\\\\\\/\\u20AC\\u07ff\\u0800\"}}   ";
     CHECK_FAILS("safetensors.name", parse(raw_file(header, "")));  // a line break in a name
     std::string good = header;
     good.replace(good.find("\\n"), 2, "");
@@ -133,7 +133,7 @@ TEST(safetensors_written_by_hand_is_read) {
     CHECK_EQUAL(file.tensors[0].name, "a");
     CHECK_EQUAL(file.get<float>("a", {})[0], 1.5f);
     CHECK_EQUAL(file.get<uint8_t>("b\u00e9", {2})[1], 'y');
-    CHECK_EQUAL(file.text("k"), "\"\\/\u20ac");
+    CHECK_EQUAL(file.text("k"), "\"\\/\u20ac\u07ff\u0800");  // three bytes from U+0800 on
     CHECK(parse(raw_file("{}", "")).tensors.empty());
 }
 

@@ -603,6 +603,12 @@ TEST(training_is_drawn_over_updates_and_compared_in_a_sentence) {
     CHECK_CONTAINS(read_file(name + "loss.svg"), ">preset paper; mean over n = 1 to 2 seeds; thin lines: each seed<");
     // Losses on 0..3, labels of 3 characters: from update 1,000 of 9,000 at 73.79 + 67.36, loss 3, to 9,000, loss 1.
     CHECK_EQUAL(count(read_file(name + "loss.svg"), "M 141.15 50 680 250 "), size_t{1});
+    const std::string other = write_run(temporary.path + "/other", "wodtem", 0, {{0, 100}}, {{"alpha", "0.5"}});
+    write(other, "progress.csv", "updates,interactions,eval_length,eval_return,eval_score\n4000,0,100,0,0\n");
+    report({folders[1], folders[2], folders[3], other}, out);
+    CHECK_CONTAINS(read_file(out + "/report.md"),
+                   "ODT 2,000; WODTEM (alpha=0.5) 4,000, 2.0 times those of ODT; "
+                   "WODTEM (alpha=0.75) 8,000, 4.0 times those of ODT. ");
     write(folders[1], "progress.csv",
           "updates,interactions,eval_length,eval_return,eval_score\n9,0,9,1,1\n8,9,9,1,1\n");
     CHECK_FAILS("csv.order", report({folders[1]}, out));

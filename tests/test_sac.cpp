@@ -440,7 +440,8 @@ TEST(sac_values_of_a_bandit_are_its_rewards_and_its_best_action_is_found) {
             CHECK_CLOSE(plain_forward(critic, {1, a})[0], 1 - (a - 0.6) * (a - 0.6), 0.05);
 }
 
-TEST(sac_first_update_moves_the_temperature_by_its_learning_rate) {  // Adam's first step is lr sign(gradient)
+// Adam's first step is lr sign(gradient); policy, temperature and each critic have moments of their own.
+TEST(sac_first_update_moves_the_temperature_by_its_learning_rate) {
     Rail environment;
     sac::Settings settings = small_settings();
     settings.random_steps = 20;
@@ -451,6 +452,9 @@ TEST(sac_first_update_moves_the_temperature_by_its_learning_rate) {  // Adam's f
     learner.step(environment);
     CHECK_EQUAL(learner.progress.updates, uint64_t{1});
     CHECK_CLOSE(learner.log_alpha[0].value[0], -3e-3, 1e-6);  // an untrained policy's entropy is above -1
+    for (const Optimizer* optimizer : {&learner.policy_optimizer, &learner.alpha_optimizer,
+                                       &learner.critic_optimizers[0], &learner.critic_optimizers[1]})
+        CHECK_EQUAL(optimizer->updates, uint64_t{1});
     const std::vector<float>&after = learner.critics[0].parameters[0].value,
           &target = learner.targets[0].parameters[0].value;
     CHECK(before != after);

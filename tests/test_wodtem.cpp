@@ -560,6 +560,7 @@ TEST(an_update_in_parts_is_the_update_of_the_whole_batch) {
         set_setting(settings, name, value);
     Fixture whole(settings), parts(settings);
     CHECK_EQUAL(parts_of_batch(settings), 3u);
+    for (Fixture* f : {&whole, &parts}) f->run.agent.temperature.log_lambda[0].value[0] = 1;  // as after many updates
     Agent& agent = whole.run.agent;
     Tape<float>& tape = whole.run.learning;
     for (int i = 0; i < 3; ++i) {
@@ -803,6 +804,43 @@ TEST(look_ups_access_all_neighbours_and_known_states_are_matched) {
     CHECK_EQUAL(f.run.tally.matched, static_cast<double>(known.length()));
 }
 
+// WODTEM eq. (6): a-hat is drawn anew in each update, by the number that belongs to the update and the step.
+TEST(advice_is_drawn_by_the_numbers_of_the_update_and_the_step) {
+    Settings settings = tiny_settings("wodtem");
+    for (auto [name, value] : {std::pair{"K", "3"}, {"epsilon", "1.5"}, {"tau", "1e6"}})  // nearly uniform over three
+        set_setting(settings, name, value);
+    Fixture f(settings);
+    std::vector<std::vector<float>> advised;
+    Batch batch = sample_batch(f.run, 0, 32);
+    for (f.run.progress.updates = 0; f.run.progress.updates < 2; ++f.run.progress.updates) {
+        consult_memory(f.run, batch);
+        for (uint32_t i = 0; i < 32; ++i) {  // windows of one step
+            const double uniform = Random{0, Stream::advised_action}.uniform(f.run.progress.updates, i);
+            if (batch.weights[i] == 1) continue;
+            CHECK_EQUAL(batch.advised_actions[i], *f.run.memory.advised_action(batch.neighbours[i], uniform));
+        }
+        advised.push_back(batch.advised_actions);
+    }
+    CHECK(advised[0] != advised[1]);
+}
+
+// ODT looks nothing up: there is no share of steps that fall short, nor of those without a neighbour. DT has no lambda.
+TEST(a_row_has_no_number_where_a_method_has_no_such_thing) {
+    const std::vector<std::string> names = split(progress_header, ',');
+    for (const char* method : {"odt", "dt"}) {
+        const Settings settings = tiny_settings(method);
+        Fixture f(settings);
+        update(f.run);
+        const std::vector<std::string> row = split(progress_line(progress_row(f.run), settings), ',');
+        const auto is_nan = [&](const char* name) {
+            return row.at(std::ranges::find(names, name) - names.begin()) == "nan";
+        };
+        for (const char* name : {"short", "unmatched", "advice"}) CHECK(is_nan(name));
+        for (const char* name : {"lambda", "entropy"}) CHECK_EQUAL(is_nan(name), settings.method == "dt");
+        CHECK(!is_nan("loss"));
+    }
+}
+
 namespace {
 // The grid world, noting the numbers of its episodes.
 struct Numbered : GridWorld {
@@ -879,6 +917,28 @@ TEST(acting_is_told_the_target_less_the_rewards_so_far) {
     CHECK_EQUAL(batch.actions[8 + 1], 1.0f);  // the second window's first step made move 1
     const Trajectory played = roll_out(f.run, GridWorld{}, Act::sample, 2, 0, 1)[0].trajectory;
     CHECK_EQUAL(played.returns_to_go[0], played.terminated ? 1.0 : 0.0);
+}
+
+// WODTEM Table I: g_online and g_eval are settings of their own; an online episode is numbered from 0.
+TEST(online_episodes_are_told_g_online_and_evaluations_g_eval) {
+    Settings settings = tiny_settings("odt");
+    set_setting(settings, "g_online", "50");
+    set_setting(settings, "g_eval", "-50");
+    Fixture f(settings);
+    for (Parameter<float>& parameter : f.run.agent.model.parameters)  // so that the fresh network heeds its target
+        if (parameter.name.ends_with("c_attn.weight") || parameter.name.ends_with("c_proj.weight"))
+            for (float& weight : parameter.value) weight *= 50;
+    for (const Episode& episode : evaluate(f.run.agent, f.run.acting, f.run.environments.all(), 0).episodes)
+        CHECK_EQUAL(episode.targets[0], -50.0f);
+    const auto moves = [&](double target) {
+        return roll_out(f.run, GridWorld{}, Act::sample, target, 0, 1)[0].trajectory.actions;
+    };
+    const std::vector<float> expected = moves(50);
+    CHECK(expected != moves(-50));
+    Observer observer;
+    observer.played = [&](const EpisodeRow& row) { CHECK(row.trajectory.actions == expected); };
+    interact(f.run, observer);
+    CHECK_EQUAL(f.run.tally.rollouts, 1.0);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1025,12 +1085,16 @@ std::pair<double, int> signalled(const Settings& settings, const std::string& fo
         }
         _exit(0);
     }
-    for (int i = 0; i < 10000 && !fs::exists(folder + "/" + file); ++i) usleep(1000);
-    usleep(100000);
     clockid_t clock = 0;
     timespec before = {};
     clock_getcpuclockid(child, &clock);
-    clock_gettime(clock, &before);
+    const auto used = [&] {
+        clock_gettime(clock, &before);
+        return static_cast<double>(before.tv_sec) + 1e-9 * static_cast<double>(before.tv_nsec);
+    };
+    for (int i = 0; i < 100000 && !fs::exists(folder + "/" + file); ++i) usleep(1000);
+    const double at_file = used();
+    for (int i = 0; i < 100000 && used() < at_file + 0.1; ++i) usleep(1000);
     kill(child, signal);
     int status = 0;
     rusage usage = {};
@@ -1057,7 +1121,7 @@ TEST(signals_end_a_run_at_once_whatever_it_is_doing) {
     }
     set_setting(settings, "width", "1024");
     set_setting(settings, "layers", "8");
-    const auto [seconds, status] = signalled(settings, scratch / "drawing", "settings", SIGTERM);
+    const auto [seconds, status] = signalled(settings, scratch / "drawing", "", SIGTERM);  // the folder comes first
     CHECK_EQUAL(status, 1);
     CHECK(seconds < 1);
     CHECK(!fs::exists(scratch / "drawing/progress.csv"));
@@ -1118,6 +1182,16 @@ TEST(expected_updates_are_those_of_the_schedule) {
     contents.evaluations = 4;
     model.settings.eval_episodes = 3;
     CHECK_EQUAL(first_of_last_evaluation(contents, model.settings), 9u);
+}
+
+// DT, which has no online phase, learns from random actions too.
+TEST(without_a_data_set_dt_alone_has_an_offline_phase) {
+    for (const char* method : {"dt", "odt", "wodtem"}) {
+        Settings settings = default_settings("hopper-medium", method, "paper");
+        choose_data_set(settings, "random", nullptr);
+        CHECK_EQUAL(settings.offline_updates, settings.method == "dt" ? 100000 : 0);
+        CHECK(settings.behaviour == "random" && (settings.online_steps == 0) == (settings.method == "dt"));
+    }
 }
 
 // A replay buffer is loaded as it was saved, with the ends of its trajectories.
@@ -1272,6 +1346,10 @@ TEST(own_data_decide_sizes_returns_and_what_is_held_out) {
     CHECK_EQUAL(continuous.reward_scale, 1.0);
     for (const auto& [reward, scale] : {std::pair{3.0f, 1.0}, {40.0f, 0.01}, {0.01f, 100.0}})
         CHECK_EQUAL(own_settings(continuous_file(scratch, reward), "odt").reward_scale, scale);
+    // Costs: the rewards are minus sevenths, and the best return is the least negative, that of 0 1 2 3 4 of them.
+    const Settings costs = own_settings(continuous_file(scratch, -1), "odt");
+    CHECK_CLOSE(costs.g_eval, -10.0 / 7, 1e-6);
+    CHECK_EQUAL(costs.reward_scale, 1.0);
     // A third of six: the third and the sixth.
     Settings third = continuous;
     third.held_out = 1.0 / 3 + 1e-12;
@@ -1508,13 +1586,18 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
                 shell("printf '1,0,0\\n5,1,1\\n5,2,2\\n' | " + act).text);
     check_shell(act + scratch / "absent", 1, "cannot open");
     // A blank line begins an episode. A Gaussian's mean depends on all steps before it, so that nothing may be left.
-    quiet_train(own_settings(continuous_file(scratch), "odt"), scratch / "own");
+    const Settings own = own_settings(continuous_file(scratch, 700), "odt");
+    quiet_train(own, scratch / "own");
     const auto answers = [&](const std::string& lines) {
         return split(shell("printf '" + lines + "' | ./wodtem act " + scratch / "own").text, '\n');
     };
     const std::vector<std::string> twice = answers("0,1\\n0.5,0\\n\\n0,1\\n0.5,0\\n");
     CHECK(twice.size() == 5 && twice[2] == twice[0] && twice[3] == twice[1]);
-    CHECK(twice[1] != answers("0.5,0\\n")[0]);
+    const std::string alone = answers("0.5,0\\n")[0];
+    CHECK(twice[1] != alone);
+    CHECK(own.reward_scale == 1e-3 && own.g_eval > 1000);  // a return is given in units of the reward
+    CHECK_EQUAL(answers(number_text(own.g_eval) + ",0.5,0\\n")[0], alone);
+    CHECK(answers("0,0.5,0\\n")[0] != alone);
     check_shell(act + "--set alpha=0.5", 2, "eval and act take --set");
 }
 
@@ -1529,6 +1612,7 @@ TEST(progress_rows_keep_to_the_schedule) {
     size_t interactions = 0;
     for (size_t i = 0; i < episodes.rows.size(); ++i) {
         interactions += std::stoul(episodes.rows[i][2]);
+        CHECK_EQUAL(episodes.rows[i][0], std::to_string(i + 1));
         CHECK_EQUAL(episodes.rows[i][1], std::to_string(interactions));
         CHECK_EQUAL(episodes.rows[i][5].size(), std::stoul(episodes.rows[i][2]));
     }
@@ -1793,6 +1877,35 @@ TEST(seconds_go_on_where_a_run_is_continued) {
     CHECK_EQUAL(results::Log(scratch / "whole/seconds.csv").table.rows.size(), 1 + progress.rows.size());
 }
 
+TEST(seconds_of_a_process_come_on_top_of_those_before_it) {
+    const Scratch scratch;
+    write_file_atomic(scratch / "s", "updates,interactions,seconds,date,machine,program\n1,2,100.500,d,m,p\n");
+    SecondsLog log{scratch / "s", "m"};
+    log.begin(true, 3, 4);
+    log.append(5, 6);
+    const std::vector<double> seconds = results::Log(scratch / "s").counts("seconds");
+    CHECK(seconds.size() == 3 && seconds[1] == 100.5 && seconds[2] >= 100.5 && seconds[2] < 160);
+}
+
+// A process that begins a phase at its half and makes another quarter of it in 100 seconds needs 100 more for the rest,
+// and then 5 for what follows the phase.
+TEST(the_time_left_follows_from_what_this_process_has_made_of_the_phase) {
+    const Scratch scratch;
+    const int err = dup(2), file = open((scratch / "lines").c_str(), O_WRONLY | O_CREAT, 0600);
+    std::fflush(stderr);
+    dup2(file, 2);
+    Console console{.terminal = false, .label = "run"};
+    console.show("offline", 1, 0, [] { return "a"; });
+    console.show("online", 0.5, 0, [] { return "b"; });
+    console.phase_began = Clock::now() - std::chrono::seconds(100);
+    console.show("online", 0.75, 5, [] { return "c"; });
+    std::fflush(stderr);
+    dup2(err, 2);
+    close(err), close(file);
+    CHECK_EQUAL(read_file(scratch / "lines"),
+                "run, offline 100% a\nrun, online  50% b\nrun, online  75% 1:45 left, c\n");
+}
+
 TEST(saving_checkpoints_takes_at_most_a_twentieth_of_the_time) {
     CheckpointTimer timer{10};
     CHECK(!timer.due());
@@ -1943,6 +2056,8 @@ TEST(episodes_whose_simulation_breaks_down_are_counted_and_used_for_nothing) {
     interact(f.run, observer);
     CHECK_EQUAL(f.run.progress.interactions, uint64_t{8});
     CHECK_EQUAL(played, 1);
+    for (int i = 0; i < 2; ++i) interact(f.run, observer);  // one breaks down, one is sound
+    CHECK(f.run.tally.rollouts == 2 && f.run.tally.rollout_length == 10 && f.run.tally.rollout_return == 10);
     const Evaluation none =
         evaluate(f.run.agent, f.run.acting, f.run.environments.first(), 1);  // episode 2^40 + 1, an odd number
     CHECK(std::isnan(none.mean_length) && std::isnan(none.mean_return));
@@ -1995,6 +2110,26 @@ TEST(a_rollout_explores_by_its_own_stream_of_random_numbers) {
     }
 }
 
+// LAMB's first step of a tensor is as long as the tensor is, times the rate: theta - r (|theta| / |u|) u. Without decay
+// ODT's code leaves that to lamb_always_adapt.
+TEST(lamb_always_adapt_moves_each_tensor_by_the_rate_times_its_length) {
+    for (const bool adapts : {true, false}) {
+        Settings settings = tiny_settings("odt");
+        for (auto [name, value] : {std::pair{"lamb_always_adapt", adapts ? "yes" : "no"}, {"warmup_updates", "1"}})
+            set_setting(settings, name, value);
+        Fixture f(settings);
+        std::vector<float>& weight = f.run.agent.model.parameters[2].value;  // embed_state.weight
+        const std::vector<float> before = weight;
+        update(f.run);
+        double moved = 0, length = 0;
+        for (size_t i = 0; i < weight.size(); ++i) {
+            moved += std::pow(double{weight[i]} - double{before[i]}, 2);
+            length += std::pow(double{before[i]}, 2);
+        }
+        CHECK_EQUAL(std::fabs(std::sqrt(moved / length) - settings.learning_rate) < 1e-5, adapts);
+    }
+}
+
 TEST(a_row_has_the_mean_gradient_norm_of_its_updates_and_the_entries_of_the_table) {
     Settings settings = tiny_settings("wodtem");
     set_setting(settings, "table_size", "10");
@@ -2007,10 +2142,13 @@ TEST(a_row_has_the_mean_gradient_norm_of_its_updates_and_the_entries_of_the_tabl
         parted.run.tally.advice_shift.resize(8);
         update(parted.run);
         CHECK(parted.run.tally.gradient_norm > 0);
+        CHECK_EQUAL(parted.run.tally.updates, 1.0);
         norms += parted.run.tally.gradient_norm;
     }
     CHECK_EQUAL(whole.run.tally.gradient_norm, norms);
+    CHECK_EQUAL(whole.run.tally.updates, 2.0);
     CHECK(whole.run.memory.insertions > 10);
+    CHECK_EQUAL(whole.run.tally.evicted, static_cast<double>(whole.run.memory.insertions - 10));  // by all of the data
     CHECK_EQUAL(progress_row(whole.run).memory_size, size_t{10});
 }
 
@@ -2029,6 +2167,27 @@ TEST(the_map_of_the_policy_is_what_an_evaluation_would_do_in_each_cell) {
             forward(f.run.acting, f.run.agent.model, acting_batch(f.run.agent, running), Queries::last_state);
         for (size_t move = 0; move < 8; ++move)
             CHECK_CLOSE(map[static_cast<size_t>(cell)][move], std::exp(policy.output.value[move]), 1e-6);
+    }
+}
+
+// start_actions.csv: the moves at S of the data set, and at the end of D_online, which is another by then.
+TEST(moves_at_the_start_are_those_of_the_data_set_and_of_the_buffer) {
+    const Scratch scratch;
+    const Settings settings = tiny_settings("odt");
+    Fixture f(settings);
+    f.run.progress.online = 1;
+    f.run.replay.trajectories = {Trajectory{{0, 0, 0, 1}, {3, 5}, {0, 0}, false, {}, {}}};
+    save_grid_results(f.run, RunFolder{scratch.path});
+    std::array<double, 8> made = {};
+    double all = 0;
+    for (const Trajectory& trajectory : make_data_set(settings))
+        for (size_t t = 0; t < trajectory.actions.size(); ++t)
+            if (trajectory.states[2 * t] == 0 && trajectory.states[2 * t + 1] == 0)
+                made[static_cast<size_t>(trajectory.actions[t])] += 1, all += 1;
+    const results::Log log(scratch / "start_actions.csv");
+    for (size_t move = 0; move < 8; ++move) {
+        CHECK_EQUAL(log.numbers("offline", 0, 1)[move], made[move] / all);
+        CHECK_EQUAL(log.numbers("online", 0, 1)[move], move == 3 ? 1.0 : 0.0);
     }
 }
 
@@ -2089,6 +2248,24 @@ Settings tiny_mujoco_settings(const std::string& task, const std::string& method
     return settings;
 }
 }  // namespace
+
+// Paths count the sound episodes alone; each keeps the goal of the environment that played it.
+TEST(a_path_keeps_its_own_goal_where_an_episode_before_it_is_dropped) {
+    const Scratch scratch;
+    const RunFolder folder{scratch.path};
+    const Environments environments(MujocoEnvironment(*find_mujoco_task("antmaze-umaze"), Physics::d4rl), 2);
+    std::vector<Episode> episodes(2);
+    for (uint64_t i = 0; i < 2; ++i) {
+        episodes[i].state.resize(29);
+        environments.all()[i]->reset({test_seed(), Stream::environment}, i, episodes[i].state.data());
+    }
+    episodes[0].error = "broken";
+    save_maze_paths(folder, episodes, environments.all());
+    const auto& goal = dynamic_cast<const MujocoEnvironment&>(*environments.all()[1]).goal;
+    const std::vector<float>& state = episodes[1].state;
+    CHECK_EQUAL(read_file(scratch / "paths.csv"),
+                "episode,step,goal_x,goal_y,x,y\n" + csv_line(0, 0, goal[0], goal[1], state[0], state[1]));
+}
 
 TEST(mujoco_runs_depend_on_neither_threads_nor_interruptions) {
     for (const char* task : {"hopper-v2", "maze2d-umaze-v1", "antmaze-umaze-v2"}) {
@@ -2625,6 +2802,19 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
 }
 
 // A pipe that nobody writes to, and 4 GB that a file system need not store, under names of both kinds.
+TEST(info_shows_d4rls_own_figures_of_a_file_of_this_name) {
+    const Scratch scratch;
+    const std::string path = scratch / "hopper_medium-v2.hdf5";
+    Hdf5Writer out(path);
+    out.add("observations", {2, 11}, std::vector<float>(22));
+    out.add("actions", {2, 3}, std::vector<float>(6));
+    out.add("rewards", {2}, std::vector<float>(2));
+    out.add("terminals", {2}, std::vector<uint8_t>{0, 1});
+    out.close();
+    check_shell("./wodtem info " + path, 0,
+                "D4RL's: 2186 trajectories, returns: mean 1422.06, deviation 378.95, 315.87 to 3222.36\n");
+}
+
 TEST(info_refuses_a_pipe_by_its_kind_and_useless_gigabytes_by_their_first_bytes) {
     const Scratch scratch;
     for (const char* name : {"pipe", "pipe.hdf5"}) {
