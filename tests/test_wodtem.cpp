@@ -2801,7 +2801,6 @@ TEST(bad_usage_exits_with_two_and_names_the_nearest) {
     fs::remove_all("/tmp/wodtem-no-threads");
 }
 
-// A pipe that nobody writes to, and 4 GB that a file system need not store, under names of both kinds.
 TEST(info_shows_d4rls_own_figures_of_a_file_of_this_name) {
     const Scratch scratch;
     const std::string path = scratch / "hopper_medium-v2.hdf5";
@@ -2815,6 +2814,7 @@ TEST(info_shows_d4rls_own_figures_of_a_file_of_this_name) {
                 "D4RL's: 2186 trajectories, returns: mean 1422.06, deviation 378.95, 315.87 to 3222.36\n");
 }
 
+// A pipe that nobody writes to, and 4 GB that a file system need not store, under names of both kinds.
 TEST(info_refuses_a_pipe_by_its_kind_and_useless_gigabytes_by_their_first_bytes) {
     const Scratch scratch;
     for (const char* name : {"pipe", "pipe.hdf5"}) {
