@@ -4,9 +4,13 @@
 // Random parts draw from test_seed(), which main prints and `build/tests --seed N` gives back.
 #pragma once
 
+#include <unistd.h>
+
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
+#include <exception>
+#include <fstream>
 #include <functional>
 #include <sstream>
 #include <string>
@@ -33,6 +37,28 @@ inline int& failed_checks() {
     return count;
 }
 inline bool add_test(Test test) { return all_tests().push_back(test), true; }
+
+// What f() prints, on stdout and stderr together; what goes to stderr comes first.
+inline std::string printed(const std::function<void()>& f) {
+    char path[] = "/tmp/wodtem-test-XXXXXX";
+    const int file = ::mkstemp(path), out = ::dup(1), err = ::dup(2);
+    std::fflush(stdout);
+    ::dup2(file, 1), ::dup2(file, 2);
+    std::exception_ptr problem;
+    try {
+        f();
+    } catch (...) {
+        problem = std::current_exception();
+    }
+    std::fflush(stdout);
+    ::dup2(out, 1), ::dup2(err, 2);
+    for (const int each : {file, out, err}) ::close(each);
+    std::ostringstream text;
+    text << std::ifstream(path).rdbuf();
+    ::unlink(path);
+    if (problem) std::rethrow_exception(problem);
+    return text.str();
+}
 
 // Prints at most 20 failures of one test: a broken kernel fails in every element.
 inline void report_failure(const char* file, int line, const std::string& what) {

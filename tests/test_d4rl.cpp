@@ -414,6 +414,57 @@ TEST(what_marks_the_ends_of_episodes_is_understood_or_refused) {
     read_rows(made_file.with(columns, {{"terminals", terminals}, {"version", {1}}, {"infos/dones", ends}}));
 }
 
+TEST(episodes_of_minari_end_as_their_flags_say_and_at_the_latest_with_their_group) {
+    const MadeFile made_file;
+    std::map<std::string, uint64_t> columns;
+    std::map<std::string, std::vector<uint8_t>> flags;
+    for (uint8_t episode = 0; episode < 3; ++episode) {
+        const std::string group = "episode_" + std::to_string(episode) + "/";
+        columns[group + "observations"] = 3;
+        columns[group + "actions"] = columns[group + "rewards"] = 2;
+        flags[group + "terminations"] = {0, episode == 0};
+        flags[group + "truncations"] = {0, episode == 1};
+    }
+    const Rows rows = read_minari(made_file.with(columns, flags));
+    CHECK(rows.terminals == (std::vector<uint8_t>{0, 1, 0, 0, 0, 0}));
+    CHECK(rows.timeouts == (std::vector<uint8_t>{0, 0, 0, 1, 0, 1}));
+}
+
+TEST(written_episodes_keep_their_ends_and_those_that_broke_down_are_left_out) {
+    const MadeFile made_file;
+    std::vector<Episode> episodes(3);
+    for (size_t i = 0; i < 3; ++i)
+        episodes[i].trajectory = {{1, 2}, {0.5f, 0.25f}, {3, static_cast<float>(i)}, i == 0, {}, {}};
+    episodes[1].error = "broken";
+    write_episodes(made_file.path, episodes, false);
+    const Rows rows = read_rows(open_hdf5(made_file.path));
+    CHECK(rows.rewards == (std::vector<float>{3, 0, 3, 2}));
+    CHECK(rows.terminals == (std::vector<uint8_t>{0, 1, 0, 0}));
+    CHECK(rows.timeouts == (std::vector<uint8_t>{0, 0, 0, 1}));
+    CHECK_FAILS("dataset.empty", write_episodes(made_file.path, {episodes[1]}, false));
+}
+
+// Medians of three steps each; the second is as far off as a step must be to count.
+TEST(the_remark_on_bodies_has_the_medians_of_both_physics) {
+    const auto remark = [](const std::array<double, 3>& d4rl, const std::array<double, 3>& other, const char* physics) {
+        TransitionsOfPhysics transitions;
+        for (size_t i = 0; i < 3; ++i)
+            transitions[0].push_back({d4rl[i], 9 - i}), transitions[1].push_back({other[i], i});
+        return remark_on_bodies(Rows{}, *find_mujoco_task("hopper"), physics, transitions);
+    };
+    CHECK_EQUAL(
+        remark({0, 0.5, 9}, {0, 0.03125, 9}, "d4rl"),
+        "other bodies made these data: recorded steps taken again end 0.5 from the recorded state under physics "
+        "d4rl, 0.03125 under 2.2; choose these with --physics 2.2");
+    CHECK_EQUAL(remark({0, 0.5, 9}, {0, far_off / 2, 9}, "2.2"), "");
+    CHECK_EQUAL(remark({0, far_off, 1}, {0, 0.5, 9}, "d4rl"),
+                "neither physics made these data: recorded steps taken again end 0.001 from the recorded state under "
+                "physics d4rl, 0.5 under 2.2 (medians), first in row 7; are they of hopper, and in the units of its "
+                "states?");
+    CHECK(first_far_off({{0, 1}, {far_off, 4}}) == size_t{4});
+    CHECK(!first_far_off({{0, 1}, {far_off / 2, 4}}));
+}
+
 TEST(trajectories_end_at_terminals_and_timeouts_and_a_tail_without_a_flag_is_none) {
     const Rows rows = made({5, 6, 7, 8, 9, 1, 2, 3}, {0, 0, 1, 0, 0, 0, 0, 0}, {0, 0, 0, 0, 0, 1, 0, 0});
     CHECK_EQUAL(shown(cut_at_flags(rows, 1000)), "0 1 2! | 3 4 5");
@@ -496,6 +547,61 @@ TEST(statistics_count_dead_columns_repetitions_and_jumps) {
     CHECK_EQUAL(statistics_of(rows, cut_at_flags(rows, 1000)).not_finite, size_t{1});
 }
 
+TEST(a_data_set_is_described_by_what_was_counted) {
+    DataSetStatistics s;
+    for (const double length : {2.0, 4.0}) s.lengths.add(length);
+    for (const double total : {-1.0, 5.0}) s.returns.add(total);
+    for (const double a : {-0.5, 0.25}) s.actions.add(a);
+    s.terminated = 1, s.left_out = 3, s.dead_columns = 4, s.repeated = 5, s.not_finite = 6, s.jumps = 7;
+    const std::string text =
+        "trajectories: 2 (1 ended by the task), 3 rows in none\nlengths:      mean 3.00, deviation 1.00, 2.00 to 4.00\n"
+        "returns:      mean 2.00, deviation 3.00, -1.00 to 5.00\nactions:      -0.5 to 0.25\n"
+        "state columns that never change: 4\nrows that repeat the observation before: 5\n"
+        "numbers that are not finite: 6\n";
+    CHECK_EQUAL(describe(s), text + "no next observations: the next row's stand in\n");
+    s.has_next = true;
+    CHECK_EQUAL(describe(s), text + "next observations that are not the next row's: 7\n");
+}
+
+// Returns of 3 and 6, so 4.5 on hopper's scale from -20.272305 to 3234.3.
+TEST(info_tells_the_score_of_the_mean_what_is_published_and_how_much_it_does_not_list) {
+    const MadeFile made_file;
+    Hdf5Writer out(made_file.path);
+    out.add("observations", {3, 11}, std::vector<float>(33));
+    out.add("actions", {3, 3}, std::vector<float>(9));
+    out.add("rewards", {3}, std::vector<float>{1, 2, 6});
+    out.add("terminals", {3}, std::vector<uint8_t>{0, 1, 1});
+    for (int i = 0; i < 41; ++i) out.add("infos/" + std::to_string(i), {1}, std::vector<float>(1));
+    out.close();
+    const std::string text = printed([&] { print_data_set(made_file.path, "hopper-medium-v2"); });
+    for (const char* line :
+         {"\n  and 5 more\n", "\nrows:         3, 11 state and 3 action numbers\ntrajectories: 2 (2 ended",
+          "\nmean normalised score of a trajectory: 0.76 (hopper)\n"})
+        CHECK(text.find(line) != std::string::npos);
+    CHECK_EQUAL(printed([] { print_published(find_published("ant-medium-v2")); }),
+                "D4RL's: 1202 trajectories, mean return 3051.26\n");
+    CHECK_EQUAL(printed([] { print_published(find_published("maze2d-umaze-v1")); }), "");
+}
+
+TEST(the_list_of_tasks_has_their_sizes_and_reference_returns) {
+    const std::string text = printed(print_tasks);
+    const std::string space(16, ' ');
+    for (const std::string& line :
+         {"\nhopper-medium-v2" + space +
+              "11 state numbers, 3 action numbers, at most 1000 steps; score 0 is a return of "
+              "-20.272305, 100 3234.3\n",
+          "\nantmaze-umaze-v2" + space +
+              "29 state numbers, 8 action numbers, at most 700 steps; score 0 is a return of "
+              "0, 100 1\n"})
+        CHECK(text.find(line) != std::string::npos);
+    CHECK(text.starts_with("gridworld                        2 state numbers, 8 moves, at most 100 steps; "));
+}
+
+TEST(the_range_of_a_tensor_is_that_of_its_finite_numbers) {
+    CHECK_EQUAL(value_range({3, NAN, 1, 2, INFINITY, -2}), "-2 to 3, mean 1, NOT FINITE: 2");
+    CHECK_EQUAL(value_range({NAN}), "nothing finite");
+}
+
 TEST(numbers_that_nobody_can_learn_from_are_refused_where_they_are) {
     const Rows sound = made({1, 2, 3}, {0, 0, 1}, {});
     const auto said = [](const Rows& rows) {
@@ -558,6 +664,12 @@ TEST(an_observation_or_a_reward_that_would_drown_all_others_is_named) {
 TEST(rows_of_another_size_or_without_an_end_are_refused) {
     const MujocoTask& hopper = *find_mujoco_task("hopper");
     CHECK_FAILS("dataset.task", cut_trajectories(made({1, 2}, {0, 1}, {}), hopper, "f"));
+    try {
+        cut_trajectories(made({1, 2}, {0, 1}, {}), hopper, "f");
+    } catch (const Error& error) {
+        CHECK(
+            std::string(error.what()).starts_with("f: has 1 state and 1 action numbers a step; hopper has 11 and 3: "));
+    }
     MujocoTask tiny = hopper;
     tiny.state_dim = tiny.action_dim = 1;
     CHECK_FAILS("dataset.empty", cut_trajectories(made({1, 2}, {0, 0}, {}), tiny, "f"));
@@ -576,6 +688,10 @@ TEST(moves_are_whole_numbers_of_an_integer_type_or_with_one_above_one) {
         CHECK_EQUAL(number_of_moves(rows, "f"), moves);
     }
     rows.actions = {-1, 2};
+    CHECK_FAILS("dataset.action", number_of_moves(rows, "f"));
+    rows.actions = {0, 9999};
+    CHECK_EQUAL(number_of_moves(rows, "f"), 10000);
+    rows.actions = {0, 10000};
     CHECK_FAILS("dataset.action", number_of_moves(rows, "f"));
     rows.action_dim = 2;  // several choices a step, which clipping would spoil
     rows.integer_actions = true;
@@ -607,6 +723,27 @@ TEST(larger_budgets_are_those_of_the_phase_that_a_run_ends_with) {
     found.online_steps = wanted.online_steps = 0;
     CHECK_EQUAL(with_larger_budgets(found, wanted).offline_updates, 200);
     CHECK_EQUAL(with_larger_budgets(wanted, found).offline_updates, 200);
+}
+
+TEST(a_run_of_other_settings_is_told_what_it_has_and_what_was_asked_for) {
+    const Settings found = default_settings("gridworld", "wodtem", "small");
+    Settings wanted = found;
+    wanted.alpha = 0.5;
+    try {
+        require_same_settings(found, wanted, "f");
+        CHECK(!"the same");
+    } catch (const Error& error) {
+        CHECK(std::string(error.what())
+                  .starts_with("f belongs to a run with alpha = 0.75, but 0.5 was asked for; choose another folder"));
+    }
+}
+
+TEST(an_update_has_at_most_a_million_steps) {
+    Settings settings = default_settings("gridworld", "wodtem", "small");
+    settings.batch_size = settings.context_length = 1000;
+    check_together(settings);
+    settings.batch_size = 1001;
+    CHECK_FAILS("usage.setting", check_together(settings));
 }
 
 // The setting came later: a file of before does not have it, and one of after only where it is yes.
