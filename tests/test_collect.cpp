@@ -273,6 +273,10 @@ TEST(ant_maze_actions_are_the_walkers_plus_noise) {
     const CollectedRows<float> set = collect_ant_maze_set(task_of("antmaze-umaze"), 1000, test_seed(), walker);
     Moments noise;
     for (const float a : set.actions) noise.add(a);
+    const Random random{test_seed(), Stream::data_set};
+    for (uint32_t i = 0; i < 701 * 8; ++i)  // of the first episode: step t, site j
+        CHECK_CLOSE(set.actions[i], std::clamp(0.2f * random.normal(data_set_episodes, i / 8, i % 8), -1.0f, 1.0f),
+                    1e-4);
     CHECK_CLOSE(noise.mean(), 0, 5 * 0.2 / std::sqrt(8000));
     CHECK_CLOSE(noise.deviation(), 0.2, 5 * 0.2 / std::sqrt(16000));
 }
@@ -386,16 +390,20 @@ TEST(trainings_have_the_published_levels_and_sizes) {
         const char *task, *set;
         double level;
         size_t rows;
-    } known[] = {{"hopper", "hopper-medium-replay-v2", 1422.06, 402000},
-                 {"walker2d", "walker2d-medium-replay-v2", 2852.09, 302000},
-                 {"halfcheetah", "halfcheetah-medium-replay-v2", 4770.33, 202000},
-                 {"ant", "ant-medium-replay-v2", 3051.26, 302000}};
-    for (const auto& [task, set, level, rows] : known) {
+        uint64_t interval;  // steps for each update
+        int episodes;       // of an evaluation: more where returns rise quickly
+    } known[] = {{"hopper", "hopper-medium-replay-v2", 1422.06, 402000, 4, 40},
+                 {"walker2d", "walker2d-medium-replay-v2", 2852.09, 302000, 2, 100},
+                 {"halfcheetah", "halfcheetah-medium-replay-v2", 4770.33, 202000, 2, 40},
+                 {"ant", "ant-medium-replay-v2", 3051.26, 302000, 2, 100}};
+    for (const auto& [task, set, level, rows, interval, episodes] : known) {
         CHECK_EQUAL(find_published(set)->steps, rows);
         const Training training = gym_training(task_of(task), 5, rows);
         CHECK_CLOSE(training.level, level, 0.01);
         CHECK(training.settings.capacity == rows + 1000 && training.settings.seed == 5);
         CHECK_EQUAL(training.name, std::string(task) + "-medium");
+        CHECK_EQUAL(training.settings.steps_per_update, interval);
+        CHECK(training.episodes == episodes && training.tolerance == (episodes == 100 ? 0.04 : 0.05));
     }
     CHECK_CLOSE(normalised_score(task_of("ant"), medium_return(task_of("ant"))), 80.30, 0.005);
 }
@@ -473,7 +481,9 @@ TEST(a_replay_set_has_d4rls_layout) {
     const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     const DataSetStatistics s = statistics_of(rows, trajectories);
     CHECK(s.left_out == 0 && s.jumps == 0 && s.repeated == 0);
-    const sac::Network<float> policy = sac::policy_of(read_safetensors(path + ".policy.safetensors"));
+    const TensorFile written = read_safetensors(path + ".policy.safetensors");  // after 100 random steps one in two
+    CHECK_EQUAL(written.text("updates") + " " + written.text("steps"), "40 180");
+    const sac::Network<float> policy = sac::policy_of(written);
     check_policy(policy, 11, 3);
     CHECK_FAILS("collect.policy", check_policy(policy, 17, 6));
 }
@@ -578,8 +588,10 @@ TEST(a_collected_file_says_how_it_was_made_and_shows_its_progress) {
     const Scratch scratch("file");
     double share = 0;
     Watch watch;
-    watch.show = [&](const char* phase, double done, const std::string&) {
+    std::string latest;
+    watch.show = [&](const char* phase, double done, const std::string& numbers) {
         CHECK_EQUAL(phase, std::string("collecting"));
+        latest = numbers;
         CHECK(done >= share && done <= 1);
         share = done;
     };
@@ -591,7 +603,9 @@ TEST(a_collected_file_says_how_it_was_made_and_shows_its_progress) {
         const std::string made_by = "wodtem collect " + id + " --steps 10000 --seed 7";
         CHECK(read_file(scratch / name).find(made_by) != std::string::npos);
         CHECK_EQUAL(read_rows(file).count, size_t{10000});
+        CHECK(file.read<float>(*file.find("metadata/seed")) == (std::vector<float>{7}));
         CHECK_EQUAL(share, 1.0);
+        CHECK_EQUAL(latest, "row 10000");
     };
     collect("maze2d-umaze-v1", "new/folder/maze.hdf5");
     collect("hopper-medium-v2", "hopper.hdf5");

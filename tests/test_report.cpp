@@ -268,6 +268,7 @@ TEST(report_states_what_the_folders_hold) {
         CHECK_CONTAINS(svg_text, ">preset paper; ");
         CHECK_CONTAINS(svg_text, "n = ");
     }
+    CHECK_CONTAINS(page, "<h1>WODTEM: report on 6 runs</h1>");
     CHECK_CONTAINS(page, "These moves reach G. Moves: 5. Moves off the grid: clipped.");
     CHECK_CONTAINS(page, "These moves do not reach G, but return to a visited cell. Moves: 5.");
     // The curve has three means, above the lines of three and two seeds, and the paper's marks of ODT and WODTEM; each
@@ -403,6 +404,9 @@ TEST(the_dose_is_shown_in_thousandths_where_it_was_logged) {
     CHECK(narrow(page).find("| WODTEM | 25.00 ± 7.07 | 10.00 ± 0.00 | 1.00 ± 0.71 |") != std::string::npos);
     CHECK(page.find("| ODT | 25") == std::string::npos);
     const std::string header = "interactions,eval_length,eval_return,eval_score,advice,advice_distance,advice_shift\n";
+    write(folders[0], "progress.csv", header + "0,6,1,1,0.02,0.01,0.001\n9,6,1,1,0.04,0.01,0.001\n");  // their mean
+    CHECK_CONTAINS(narrow(report({folders[0]}, scratch.path + "/report")),
+                   "| WODTEM | 30.00 ± - | 10.00 ± - | 1.00 ± - |");
     write(folders[3], "progress.csv",
           header + "0,6,1,1,nan,nan,nan\n9,6,1,1,nan,nan,nan\n");  // of a method without one
     report({folders[3]}, scratch.path + "/report");
@@ -444,6 +448,18 @@ TEST(report_of_a_mujoco_task_has_scores_lengths_and_physics) {
                    ">hopper-medium-v2: evaluation length over online interactions<");
     CHECK_CONTAINS(read_file(out + "/hopper-medium-v2-paper-score.svg"),
                    ">preset paper, physics d4rl; mean over n = 1 to 2 seeds; thin lines: each seed<");
+}
+
+TEST(a_page_says_how_the_episodes_of_its_task_end) {
+    for (const auto& [task, end, has_lengths] :
+         {std::tuple("halfcheetah-medium-v2", "Every episode takes 1,000 steps.", false),
+          {"antmaze-umaze-v2", "An episode ends at the goal, or after 700 steps.", true}}) {
+        const TemporaryFolder temporary;
+        const std::string out = temporary.path + "/out/";
+        report({write_mujoco_run(temporary.path, task, "odt", 0, {{0, 9, 1, 50}, {900, 9, 1, 50}})}, out);
+        CHECK_CONTAINS(read_file(out + "report.md"), end);
+        CHECK_EQUAL(std::filesystem::exists(out + task + "-paper-length.svg"), has_lengths);
+    }
 }
 
 TEST(physics_are_never_mixed) {
@@ -983,12 +999,29 @@ TEST(report_names_each_way_a_folder_can_be_wrong) {
     fails("csv.order", "progress.csv", "interactions,eval_length,eval_return,eval_score\n9,9,1,1\n8,9,1,1\n");
     fails("csv.number", "progress.csv", "interactions,eval_length,eval_return,eval_score\nnan,9,1,1\n");
     fails("csv.number", "episodes.csv", "interactions,length,return\n101,101,0\n");
+    fails("csv.number", "episodes.csv", "interactions,length,return\n1,0,0\n");
     fails("csv.number", "policy.csv", std::string(policy).replace(policy.find("0.65"), 4, "1.65"));
     fails("csv.rows", "policy.csv", policy + "6,0,1,0,0,0,0,0,0,0\n");
     fails("csv.rows", "policy.csv", policy.substr(0, policy.rfind("\n5,5") + 1));
     fails("csv.rows", "start_actions.csv", std::string(start).replace(start.find("\nD,"), 3, "\nX,"));
     std::filesystem::remove(good + "/policy.csv");  // finished, so it must be there
     CHECK_FAILS("file.open", report({good}, out));
+}
+
+TEST(cells_out_of_place_are_named_with_their_line) {
+    const Log log("policy.csv", "row\n0\n1\n3\n");
+    try {
+        log.check_column("row", 3, [](int i) { return std::to_string(i); });
+        CHECK(!"in place");
+    } catch (const Error& error) {
+        CHECK_CONTAINS(std::string(error.what()), "policy.csv: line 4: column \"row\" does not name the 3 cells");
+    }
+}
+
+TEST(durations_are_hours_minutes_and_seconds) {
+    for (const auto& [seconds, text] :
+         {std::pair(75.9, "1:15"), {3599.0, "59:59"}, {3675.0, "1:01:15"}, {-1.0, "0:00"}})
+        CHECK_EQUAL(clock_text(seconds), text);
 }
 
 TEST(csv_errors_name_the_line) {

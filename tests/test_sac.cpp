@@ -504,6 +504,57 @@ TEST(sac_update_draws_what_is_documented) {
     CHECK_CLOSE(policy_loss, actor, 1e-5);
 }
 
+namespace {
+// Two actions, whose product is paid, and five steps.
+struct Plane : Environment {
+    EnvironmentSpec spec() const override { return {1, 2, 0, 5}; }
+    void reset(const Random&, uint64_t, float* state) override { *state = 0; }
+    Step step(const float* action, float* state) override { return {*state = action[0] * action[1], false}; }
+    std::unique_ptr<Environment> clone() const override { return std::make_unique<Plane>(*this); }
+};
+}  // namespace
+
+// Of action j: site j of its step or its row, in the loss of the first update as well.
+TEST(sac_numbers_of_two_actions_are_those_of_the_table) {
+    Plane environment;
+    sac::Settings settings = small_settings();
+    settings.random_steps = 20;
+    settings.batch = 16;
+    sac::Learner learner(settings, environment.spec(), one_thread());
+    for (int i = 0; i < 20; ++i) learner.step(environment);
+    for (uint32_t j = 0; j < 2; ++j)
+        CHECK_EQUAL(learner.replay.action(7)[j],
+                    static_cast<float>(2 * Random{settings.seed, Stream::exploration}.uniform(1, 2, j) - 1));
+    const sac::Network<float> policy = learner.policy;
+    const sac::Pair<float> critics = learner.critics;
+    const float policy_loss = learner.update().second;
+    const double alpha = std::exp(static_cast<double>(learner.log_alpha[0].value[0]));
+    double expected = 0;
+    for (uint32_t i = 0; i < 16; ++i) {
+        const float* row = learner.replay.row(Random{settings.seed, Stream::batch}.below(20, 0, i));
+        const std::vector<double> output = plain_forward(policy, {*row});
+        std::vector<double> pair = {*row};
+        for (uint32_t j = 0; j < 2; ++j) {
+            const double z = static_cast<double>(Random{settings.seed, Stream::entropy_noise}.normal(0, i, j));
+            const double a = pair.emplace_back(std::tanh(output[j] + std::exp(output[2 + j]) * z));
+            expected += alpha * (-z * z / 2 - output[2 + j] - half_log_2_pi - std::log(1 - a * a)) / 16;
+        }
+        expected -= std::min(plain_forward(critics[0], pair)[0], plain_forward(critics[1], pair)[0]) / 16;
+    }
+    CHECK_CLOSE(policy_loss, expected, 1e-5);
+}
+
+// Six tensors each: the policy's are numbered from 0, the critics' from 6 and 12.
+TEST(sac_critics_begin_with_numbers_of_their_own) {
+    const sac::Settings settings = small_settings();
+    const sac::Learner learner(settings, Plane{}.spec(), one_thread());
+    const Random random{settings.seed, Stream::initialisation};
+    for (uint32_t k = 0; k < 2; ++k)
+        for (uint32_t i = 0; i < 9; ++i)
+            CHECK_CLOSE(learner.critics[k].parameters[0].value[i],
+                        (2 * random.uniform(6 * (k + 1), i) - 1) / std::sqrt(32.0), 1e-7);
+}
+
 TEST(sac_episodes_end_by_the_task_the_time_limit_or_the_engine) {
     Rail environment;
     environment.bounded = true;
@@ -623,10 +674,15 @@ TEST(sac_checkpoint_of_another_run_is_refused) {
     for (int i = 0; i < 7; ++i) learner.step(environment);
     sac::save_checkpoint(file.path, learner, "task=line");
     CHECK_FAILS("sac.checkpoint", sac::load_checkpoint(file.path, learner, "task=other"));
-    sac::Settings other = settings;
-    other.discount = 0.5;
-    sac::Learner changed(other, environment.spec(), one_thread());
-    CHECK_FAILS("sac.checkpoint", sac::load_checkpoint(file.path, changed, "task=line"));
+    using Change = void (*)(sac::Settings&);
+    for (const Change change :
+         {Change([](auto& s) { s.discount = 0.5; }), Change([](auto& s) { s.reward_scale = 2; }),
+          Change([](auto& s) { s.steps_per_update = 2; }), Change([](auto& s) { s.target_rate = 0.5; })}) {
+        sac::Settings other = settings;
+        change(other);
+        sac::Learner changed(other, environment.spec(), one_thread());
+        CHECK_FAILS("sac.checkpoint", sac::load_checkpoint(file.path, changed, "task=line"));
+    }
     sac::Learner same(settings, environment.spec(), one_thread());
     sac::load_checkpoint(file.path, same, "task=line");
     Rail elsewhere;

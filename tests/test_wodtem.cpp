@@ -46,21 +46,7 @@ Settings tiny_settings(const std::string& method, const std::string& alpha = "0.
 }
 
 // Calls f() with nothing printed.
-void quietly(const std::function<void()>& f) {
-    const int out = dup(1), err = dup(2), null = open("/dev/null", O_WRONLY);
-    std::fflush(stdout);
-    dup2(null, 1), dup2(null, 2);
-    std::exception_ptr problem;
-    try {
-        f();
-    } catch (...) {
-        problem = std::current_exception();
-    }
-    std::fflush(stdout);
-    dup2(out, 1), dup2(err, 2);
-    close(out), close(err), close(null);
-    if (problem) std::rethrow_exception(problem);
-}
+void quietly(const std::function<void()>& f) { printed(f); }
 
 void quiet_train(
     const Settings& settings, const std::string& folder, int threads = 1, double checkpoint_every = 1e9,
@@ -1155,21 +1141,85 @@ TEST(evaluation_needs_the_model_file_alone) {
     CHECK_EQUAL(number_text(evaluation.mean_return), progress.rows.back()[13]);
 }
 
-// Two returns, 1 and 3: mean 2, standard deviation with the divisor n - 1 the root of 2.
-TEST(eval_prints_the_deviation_of_a_sample) {
-    const Scratch scratch;
-    std::vector<Episode> episodes(2);
-    for (int i = 0; i < 2; ++i) {
-        episodes[i].trajectory = {{0, 0}, {1}, {1.0f + 2 * static_cast<float>(i)}, false, {}, {}};
+// Returns of 0 and 2: mean 1, standard deviation with the divisor n - 1 the root of 2. The second episode broke down.
+TEST(eval_prints_the_deviation_of_a_sample_the_moves_of_an_episode_and_how_many_were_sound) {
+    std::vector<Episode> episodes(3);
+    for (size_t i = 0; i < 3; ++i) {
+        episodes[i].trajectory = {{0, 0, 1, 1}, {4, 7}, {0, static_cast<float>(i)}, false, {}, {}};
         relabel(episodes[i].trajectory, 2, 1, 1);
     }
-    const int out = dup(1), file = open((scratch / "out").c_str(), O_WRONLY | O_CREAT, 0600);
-    std::fflush(stdout);
-    dup2(file, 1);
-    print_evaluation(tiny_settings("odt"), episodes, 1, 2);
-    std::fflush(stdout);
-    dup2(out, 1), close(out), close(file);
-    CHECK(read_file(scratch / "out").find("mean return 2 +- 1.4142135 over 2 episodes") != std::string::npos);
+    episodes[1].error = "broken";
+    CHECK_EQUAL(
+        printed([&] { print_evaluation(tiny_settings("odt"), episodes, 2, 1); }),
+        "episode 1: length 2, return 0 R-D L-U\nwodtem: episode 2 is dropped: broken\nepisode 3: length 2, return "
+        "2 R-D L-U\ngridworld, odt, seed 0: mean length 2, mean return 1 +- 1.4142135 over 2 episodes (grid world)\n");
+}
+
+TEST(the_last_line_of_a_run_and_those_of_its_progress_have_its_numbers) {
+    ProgressRow row = {true, 101, 102, 3, 0.5, 0.25, 104, 5.5, 0.5, 0.5, {}};
+    row.tally.loss = 3, row.tally.updates = 2;
+    CHECK_EQUAL(printed([&] { print_end("a", row, tiny_settings("odt")); }),
+                "a: 101 updates, 102 interactions, evaluation length 5.5, return 0.5\n");
+    CHECK_EQUAL(score_text(default_settings("hopper-v2", "odt", "small"), 3234.3), ", normalised score 100");
+    CHECK_EQUAL(status_text(row, 12),
+                "update 101, interaction 102, loss 1.5, evaluation: length 5.5, return 0.5, 12 updates a second");
+    row = {false, 101, 0, 0, 0.5, 0.25, 104, NAN, NAN, NAN, {}};
+    CHECK_EQUAL(status_text(row, 12), "update 101, 12 updates a second");
+}
+
+TEST(a_row_of_an_episode_has_its_return_its_end_and_its_moves) {
+    Trajectory trajectory{std::vector<float>(6), {4, 7, 0}, {0, 0, 1}, true, {}, {}};
+    relabel(trajectory, 2, 1, 0.5);
+    CHECK_EQUAL(episode_line({5, 12, trajectory, true}, tiny_settings("odt")), "5,12,3,1,1,470,grid world\n");
+    trajectory.terminated = false;
+    CHECK_EQUAL(episode_line({5, 12, trajectory, false}, tiny_settings("odt")), "5,12,3,1,0,,grid world\n");
+}
+
+TEST(every_smaller_budget_is_a_line_of_its_file) {
+    const Scratch scratch;
+    const RunFolder folder{scratch.path};
+    Settings begun = tiny_settings("odt"), larger = begun;
+    for (const int64_t steps : {500, 600, 600}) {  // the last time it was stopped before it had begun
+        if (steps != larger.online_steps) begun = larger;
+        larger.online_steps = steps;
+        for (const char* name : {"finished", "kept.safetensors"}) write_file_atomic(folder.file(name), name);
+        go_on(folder, begun, larger);
+        CHECK(!folder.has("finished") && !folder.has("kept.safetensors") && folder.has("checkpoint.safetensors"));
+        CHECK_EQUAL(settings_from_text(read_file(folder.file("settings")), "f").online_steps, steps);
+    }
+    CHECK_EQUAL(read_file(folder.file("budgets")),
+                "offline_updates = 40, online_steps = 400\noffline_updates = 40, online_steps = 500\n");
+}
+
+TEST(each_of_several_runs_is_announced_by_its_number_method_and_seed) {
+    const auto plan = [](const std::vector<std::string>& words) {
+        return planned_runs(parse_arguments(commands[0], words));
+    };
+    std::vector<PlannedRun> runs = plan({"gridworld", "--methods", "dt,odt", "--seeds", "3-4", "--out", "x"});
+    const char* const labels[] = {"1 of 4: DT, seed 3", "2 of 4: DT, seed 4", "3 of 4: ODT, seed 3",
+                                  "4 of 4: ODT, seed 4"};
+    for (size_t i = 0; i < 4; ++i) CHECK_EQUAL(runs.at(i).label, labels[i]);
+    CHECK_EQUAL(plan({"gridworld"})[0].label, "WODTEM, seed 0");
+    const std::string start = "4 of 4: ODT, seed 4: task ",
+                      end = ", folder x/odt/seed-4; all settings: x/odt/seed-4/settings\n";
+    const auto announced = [&] { return printed([&] { announce(runs[3]); }); };
+    CHECK_EQUAL(announced(), start + "gridworld, preset small, data set made on the spot" + end);
+    runs[3].settings.task = "hopper-v2";
+    CHECK_EQUAL(announced(), start + "hopper-v2, preset small, data set none (random actions)" + end);
+    runs[3].settings.dataset = "a.hdf5", runs[3].settings.dataset_path = "/b/a.hdf5";
+    CHECK_EQUAL(announced(), start + "hopper-v2, preset small, data set a.hdf5" + end);
+}
+
+// 45 minutes for one seed of all methods.
+TEST(a_sweep_estimates_all_its_seeds_and_passes_its_options_on) {
+    const auto sweep = std::ranges::find(commands, std::string_view("sweep"), &Command::name);
+    const Arguments arguments =
+        parse_arguments(*sweep, {"hopper", "--methods", "dt", "--seeds", "5,8", "--clip-actions", "--estimate"});
+    const std::string line = "# ./wodtem train hopper-v2 --method dt --preset small --seed ";
+    CHECK_EQUAL(printed([&] { print_sweep(swept_settings(arguments), arguments, 2700); }),
+                line + "5 --clip-actions\n" + line +
+                    "8 --clip-actions\n# about 1.5 hours on this machine, one after the other; what is interrupted "
+                    "continues\n");
 }
 
 TEST(expected_updates_are_those_of_the_schedule) {
@@ -1218,6 +1268,7 @@ TEST(a_checkpoint_keeps_each_sum_and_a_row_has_it_in_its_column) {
     saved.pairs = 4, saved.short_pairs = 1, saved.unmatched_pairs = 2;
     saved.rollout_length = 80, saved.rollout_return = 88, saved.rollouts = 8;
     saved.matched = 21, saved.evicted = 22, saved.dropped = 23, saved.advice = 9, saved.advice_distance = 11;
+    saved.advice_shift = {2, 0, -2, 0, 0, 0, 0, 0};  // probability of 2 is moved
     const Settings settings = tiny_settings("wodtem");
     Fixture f(settings), g(settings);
     f.run.tally = saved;
@@ -1231,12 +1282,14 @@ TEST(a_checkpoint_keeps_each_sum_and_a_row_has_it_in_its_column) {
     line.erase(line.find_last_not_of('\n') + 1);
     const std::vector<std::string> fields = split(line, ','), names = split(progress_header, ',');
     const std::map<std::string, std::string> expected = {
-        {"phase", "online"},      {"updates", "101"},        {"interactions", "102"}, {"episodes", "103"},
-        {"learning_rate", "0.5"}, {"loss", "1.5"},           {"entropy", "2.5"},      {"lambda", "0.25"},
-        {"gradient_norm", "3.5"}, {"short", "0.25"},         {"unmatched", "0.5"},    {"memory", "104"},
-        {"eval_length", "105"},   {"eval_return", "106"},    {"eval_score", "107"},   {"rollout_length", "10"},
-        {"rollout_return", "11"}, {"matched", "21"},         {"evicted", "22"},       {"dropped", "23"},
-        {"advice", "4.5"},        {"advice_distance", "5.5"}};
+        {"phase", "online"},        {"updates", "101"},       {"interactions", "102"},
+        {"episodes", "103"},        {"learning_rate", "0.5"}, {"loss", "1.5"},
+        {"entropy", "2.5"},         {"lambda", "0.25"},       {"gradient_norm", "3.5"},
+        {"short", "0.25"},          {"unmatched", "0.5"},     {"memory", "104"},
+        {"eval_length", "105"},     {"eval_return", "106"},   {"eval_score", "107"},
+        {"rollout_length", "10"},   {"rollout_return", "11"}, {"matched", "21"},
+        {"evicted", "22"},          {"dropped", "23"},        {"advice", "4.5"},
+        {"advice_distance", "5.5"}, {"advice_shift", "1"}};
     size_t found = 0;
     for (size_t i = 0; i < fields.size(); ++i)
         if (expected.contains(names.at(i))) found += fields[i] == expected.at(names[i]);
@@ -1410,6 +1463,24 @@ TEST(held_out_measurements_are_means_over_steps) {
     }
     Fixture f(tiny_settings("odt"));
     CHECK(std::isnan(measure(f.run.agent, f.run.acting, {}).log_prob));
+}
+
+TEST(held_out_numbers_are_printed_and_logged_as_they_are_measured) {
+    const Scratch scratch;
+    const Settings settings = own_settings(grid_file(scratch), "odt");
+    const std::string said =
+        printed([&] { train(settings, scratch / "run", {.kernel = kernel_for(settings.arithmetic)}); });
+    Compute compute(best_kernel(), 1);
+    Run run(compute, settings, *make_environment(settings));
+    ModelContents contents = contents_of(run.agent);
+    load_model(contents, open_model(scratch / "run/model.safetensors"));
+    const HeldOut measured = measure(run.agent, run.acting, part_of_own_data(settings, true));
+    const std::string log_prob = number_text(static_cast<float>(measured.log_prob)),
+                      error = number_text(static_cast<float>(measured.error));
+    const std::vector<std::string> row = results::Log(scratch / "run/progress.csv").table.rows.back();
+    CHECK_EQUAL(row[row.size() - 2] + " " + row.back(), log_prob + " " + error);
+    CHECK(said.find("; log-probability of an action " + log_prob + ", share of other moves " + error + "\n") !=
+          std::string::npos);
 }
 
 TEST(training_on_own_data_learns_and_continues_to_the_same_bytes) {
@@ -1890,20 +1961,14 @@ TEST(seconds_of_a_process_come_on_top_of_those_before_it) {
 // A process that begins a phase at its half and makes another quarter of it in 100 seconds needs 100 more for the rest,
 // and then 5 for what follows the phase.
 TEST(the_time_left_follows_from_what_this_process_has_made_of_the_phase) {
-    const Scratch scratch;
-    const int err = dup(2), file = open((scratch / "lines").c_str(), O_WRONLY | O_CREAT, 0600);
-    std::fflush(stderr);
-    dup2(file, 2);
-    Console console{.terminal = false, .label = "run"};
-    console.show("offline", 1, 0, [] { return "a"; });
-    console.show("online", 0.5, 0, [] { return "b"; });
-    console.phase_began = Clock::now() - std::chrono::seconds(100);
-    console.show("online", 0.75, 5, [] { return "c"; });
-    std::fflush(stderr);
-    dup2(err, 2);
-    close(err), close(file);
-    CHECK_EQUAL(read_file(scratch / "lines"),
-                "run, offline 100% a\nrun, online  50% b\nrun, online  75% 1:45 left, c\n");
+    const std::string lines = printed([] {
+        Console console{.terminal = false, .label = "run"};
+        console.show("offline", 1, 0, [] { return "a"; });
+        console.show("online", 0.5, 0, [] { return "b"; });
+        console.phase_began = Clock::now() - std::chrono::seconds(100);
+        console.show("online", 0.75, 5, [] { return "c"; });
+    });
+    CHECK_EQUAL(lines, "run, offline 100% a\nrun, online  50% b\nrun, online  75% 1:45 left, c\n");
 }
 
 TEST(saving_checkpoints_takes_at_most_a_twentieth_of_the_time) {
@@ -1994,7 +2059,7 @@ TEST(numbers_that_are_not_finite_stop_the_run_and_name_the_tensor) {
     } catch (const Error& error) {
         CHECK_EQUAL(error.id, "nn.not_finite");
         const std::string sentence = error.what();
-        CHECK(sentence.find("update ") == 0 && sentence.find(scratch / "run") != std::string::npos);
+        CHECK(sentence.find("update 2 of ") == 0 && sentence.find(scratch / "run") != std::string::npos);
     }
 }
 
@@ -2170,6 +2235,20 @@ TEST(the_map_of_the_policy_is_what_an_evaluation_would_do_in_each_cell) {
     }
 }
 
+TEST(the_policy_is_written_cell_by_cell_and_that_of_the_start_beside_the_datas) {
+    const Scratch scratch;
+    Fixture f(tiny_settings("odt"));
+    for (int i = 0; i < 20; ++i) update(f.run);
+    save_grid_results(f.run, RunFolder{scratch.path});
+    const std::vector<std::vector<float>> map = policy_by_cell(f.run, GridWorld{});
+    const std::vector<results::MoveShares> written = results::read_policy(results::Log(scratch / "policy.csv"));
+    const std::vector<double> learned = results::Log(scratch / "start_actions.csv").numbers("learned", 0, 1);
+    for (size_t move = 0; move < 8; ++move) {
+        for (size_t cell = 0; cell < 36; ++cell) CHECK_CLOSE(written[cell][move], map[cell][move], 1e-6);
+        CHECK_CLOSE(learned[move], map[0][move], 1e-6);
+    }
+}
+
 // start_actions.csv: the moves at S of the data set, and at the end of D_online, which is another by then.
 TEST(moves_at_the_start_are_those_of_the_data_set_and_of_the_buffer) {
     const Scratch scratch;
@@ -2260,11 +2339,15 @@ TEST(a_path_keeps_its_own_goal_where_an_episode_before_it_is_dropped) {
         environments.all()[i]->reset({test_seed(), Stream::environment}, i, episodes[i].state.data());
     }
     episodes[0].error = "broken";
+    episodes[1].trajectory.states.resize(2 * 29);
+    std::iota(episodes[1].trajectory.states.begin(), episodes[1].trajectory.states.end(), 0.0f);
+    episodes[1].trajectory.rewards = {0, 0};
     save_maze_paths(folder, episodes, environments.all());
     const auto& goal = dynamic_cast<const MujocoEnvironment&>(*environments.all()[1]).goal;
     const std::vector<float>& state = episodes[1].state;
     CHECK_EQUAL(read_file(scratch / "paths.csv"),
-                "episode,step,goal_x,goal_y,x,y\n" + csv_line(0, 0, goal[0], goal[1], state[0], state[1]));
+                "episode,step,goal_x,goal_y,x,y\n" + csv_line(0, 0, goal[0], goal[1], 0, 1) +
+                    csv_line(0, 1, goal[0], goal[1], 29, 30) + csv_line(0, 2, goal[0], goal[1], state[0], state[1]));
 }
 
 TEST(mujoco_runs_depend_on_neither_threads_nor_interruptions) {
