@@ -39,26 +39,6 @@ std::vector<std::string> vector_files() {
     return names;
 }
 
-// What f prints to stdout and stderr.
-std::string printed(const std::function<void()>& f) {
-    char path[] = "/tmp/wodtem-vectors-XXXXXX";
-    const int file = ::mkstemp(path), out = ::dup(1), err = ::dup(2);
-    std::fflush(stdout);
-    ::dup2(file, 1), ::dup2(file, 2);
-    std::exception_ptr problem;
-    try {
-        f();
-    } catch (...) {
-        problem = std::current_exception();
-    }
-    std::fflush(stdout);
-    ::dup2(out, 1), ::dup2(err, 2);
-    const std::string text = read_file(path);
-    ::close(file), ::close(out), ::close(err), ::unlink(path);
-    if (problem) std::rethrow_exception(problem);
-    return text;
-}
-
 struct Checked {
     bool holds = false;
     std::string text;
