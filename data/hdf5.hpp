@@ -1169,7 +1169,8 @@ struct Hdf5Parser {
     }
 
     // Returns `bytes`, if that is in proportion to the file: deflate shrinks at most 1032-fold, and data that are all
-    // fill value take nothing. Errors: hdf5.too_large.
+    // fill value take nothing. Above 16 GiB it is no more than uncompressed bytes become as floats. Errors:
+    // hdf5.too_large.
     uint64_t bounded(uint64_t bytes, const Cursor& c) const {
         const uint64_t stored = file.bytes.size(), most = uint64_t{1} << 34;
         const uint64_t limit = std::max(4 * stored, std::min(most, 1040 * stored + (1 << 26)));

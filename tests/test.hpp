@@ -38,7 +38,7 @@ inline int& failed_checks() {
 }
 inline bool add_test(Test test) { return all_tests().push_back(test), true; }
 
-// What f() prints, on stdout, which main has written line by line, and on stderr.
+// Returns what f() prints, on stdout (which main makes line by line) and on stderr.
 inline std::string printed(const std::function<void()>& f) {
     char path[] = "/tmp/wodtem-test-XXXXXX";
     const int file = ::mkstemp(path), out = ::dup(1), err = ::dup(2);

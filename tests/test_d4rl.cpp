@@ -3,6 +3,7 @@
 #include <unistd.h>
 
 #include "../data/info.hpp"
+#include "hdf5_files.hpp"
 #include "test.hpp"
 
 namespace {
@@ -184,11 +185,7 @@ TEST(episodes_of_minari_whose_numbers_have_gaps_are_all_read) {
 namespace {
 
 // A file that Minari wrote: tests/hdf5/NAME.z, as make.py says.
-Hdf5File file_of_minari(const std::string& name) {
-    const std::string packed = read_file("tests/hdf5/" + name + ".z");
-    const auto bytes = inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8)));
-    return parse_hdf5(std::string(bytes.begin(), bytes.end()), name);
-}
+Hdf5File file_of_minari(const std::string& name) { return parse_hdf5(hdf5_bytes(name), name); }
 
 std::vector<std::string> remarks_of(const Rows& rows, const MujocoTask& task, const std::string& physics) {
     return remarks_on(rows, task, physics, transitions_of_each_physics(rows, task));

@@ -8,7 +8,7 @@
 #include <filesystem>
 #include <fstream>
 
-#include "../data/hdf5.hpp"
+#include "hdf5_files.hpp"
 #include "test.hpp"
 
 namespace {
@@ -19,13 +19,6 @@ struct Folder {
     ~Folder() { std::filesystem::remove_all(path); }
     std::string operator/(const std::string& name) const { return (path / name).string(); }
 };
-
-// tests/hdf5/NAME.z: the size, then a zlib stream.
-std::string fixture(const std::string& name) {
-    const std::string packed = read_file("tests/hdf5/" + name + ".z");
-    const auto bytes = inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8)));
-    return std::string(bytes.begin(), bytes.end());
-}
 
 Hdf5File parse(const std::string& bytes) { return parse_hdf5(bytes, "test"); }
 
@@ -188,7 +181,7 @@ TEST(inflate_reads_all_three_kinds_of_blocks) {  // streams of Python's zlib
     CHECK(inflates_to(fixed, period));
     CHECK(inflates_to(dynamic, squares));
     CHECK(inflates_to(unhex("789c030000000001"), ""));
-    const std::string skewed = fixture("skewed");  // codes of up to 15 bits
+    const std::string skewed = hdf5_bytes("skewed");  // codes of up to 15 bits
     std::string expected, mixed;
     for (size_t k = 0, a = 1, b = 1; k < 17; ++k, std::swap(a, b), b += a)
         expected += std::string(a, static_cast<char>(k));
@@ -229,7 +222,7 @@ TEST(inflate_refuses_invalid_streams) {
 TEST(hdf5_files_made_by_h5py_are_read) {
     using enum Hdf5Filter;
     for (const char* name : {"old", "latest", "latest-1.12"}) {
-        const Hdf5File file = parse(fixture(name));
+        const Hdf5File file = parse(hdf5_bytes(name));
         check_contents(name, file, std::string(name) == "latest-1.12" ? 62 : 63);
         const auto type = [&](const char* path) { return file.find(path) == nullptr ? "none" : file.find(path)->type; };
         CHECK_EQUAL(type("types/float32"), "float32");
@@ -266,7 +259,7 @@ TEST(hdf5_files_made_by_h5py_are_read) {
 
 TEST(hdf5_soft_links_and_attributes_of_the_root_are_read) {
     for (const char* name : {"root_old", "root_latest"}) {
-        const Hdf5File file = parse(fixture(name));
+        const Hdf5File file = parse(hdf5_bytes(name));
         check_contents(name, file, 1);
         CHECK(file.attributes == (std::map<std::string, double>{{"total_episodes", 12}, {"half", 0.5}}));
         CHECK_EQUAL(file.links.size(), size_t{8});
@@ -277,7 +270,7 @@ TEST(hdf5_soft_links_and_attributes_of_the_root_are_read) {
         for (const char* path : {"gone", "circle", "alias/d", "self/gone"}) CHECK_FAILS("hdf5.link", file.find(path));
     }
     try {
-        parse(fixture("latest")).find("strange/external");
+        parse(hdf5_bytes("latest")).find("strange/external");
     } catch (const Error& error) {
         CHECK_EQUAL(std::string(error.what()),
                     "test: \"strange/external\": is a link to \"another file: elsewhere.hdf5 /x\", which is no data "
@@ -288,7 +281,7 @@ TEST(hdf5_soft_links_and_attributes_of_the_root_are_read) {
 // tests/hdf5/make.py, peers(): of half precision the values are written down here again, from the standard.
 TEST(hdf5_files_with_lzf_halves_and_hard_links_are_read) {
     for (const char* name : {"peers_old", "peers_latest"}) {
-        const Hdf5File file = parse(fixture(name));
+        const Hdf5File file = parse(hdf5_bytes(name));
         for (const auto& [path, filters] :
              {std::pair("lzf/float", 1), {"lzf/shuffled", 3}, {"lzf/zeros", 1}, {"lzf/kept", 1}}) {
             const Hdf5Dataset* dataset = file.find(path);
@@ -331,7 +324,7 @@ TEST(hdf5_files_with_lzf_halves_and_hard_links_are_read) {
 
 TEST(hdf5_data_that_cannot_be_read_are_refused_in_words) {
     const auto said = [](const char* name, const char* path) {
-        const Hdf5File file = parse(fixture(name));
+        const Hdf5File file = parse(hdf5_bytes(name));
         try {
             file.read<float>(*file.find(path));
         } catch (const Error& error) {
@@ -360,7 +353,7 @@ TEST(hdf5_data_that_cannot_be_read_are_refused_in_words) {
 }
 
 TEST(hdf5_files_of_pytables_hold_flags_in_bit_fields) {
-    const Hdf5File file = parse(fixture("tables"));
+    const Hdf5File file = parse(hdf5_bytes("tables"));
     for (const char* path : {"flags", "zipped"}) {
         CHECK_EQUAL(file.find(path)->type, "bit field of 8");
         const std::vector<uint8_t> flags = file.read_flags(*file.find(path));
@@ -397,12 +390,12 @@ TEST(lzf_streams_are_decompressed_or_refused) {
 }
 
 TEST(hdf5_large_indexes_and_groups_are_read) {
-    check_contents("old_large", parse(fixture("old_large")), 6);
-    check_contents("latest_large", parse(fixture("latest_large")), 6);
-    check_contents("edges", parse(fixture("edges")), 2);
-    check_contents("many_old", parse(fixture("many_old")), 401);
-    check_contents("long_names", parse(fixture("long_names")), 301);
-    const Hdf5File many = parse(fixture("many_latest"));
+    check_contents("old_large", parse(hdf5_bytes("old_large")), 6);
+    check_contents("latest_large", parse(hdf5_bytes("latest_large")), 6);
+    check_contents("edges", parse(hdf5_bytes("edges")), 2);
+    check_contents("many_old", parse(hdf5_bytes("many_old")), 401);
+    check_contents("long_names", parse(hdf5_bytes("long_names")), 301);
+    const Hdf5File many = parse(hdf5_bytes("many_latest"));
     check_contents("many_latest", many, 5001);
     for (int i = 0; i < 5000; ++i) CHECK(many.find("many/episode_" + std::to_string(i)) != nullptr);
     CHECK(many.find("many/episode_5000") == nullptr);
@@ -410,20 +403,20 @@ TEST(hdf5_large_indexes_and_groups_are_read) {
 }
 
 TEST(hdf5_superblocks_of_every_version_are_read) {
-    const std::string base = fixture("userblock");
+    const std::string base = hdf5_bytes("userblock");
     CHECK_EQUAL(int{base[1024 + 8]}, 0);
     check_contents("userblock", parse(base), 1);
     const int versions[] = {0, 1, 2, 3};
     const char* names[] = {"small_old", "superblock1", "superblock2", "small_latest"};
     for (size_t i = 0; i < 4; ++i) {
-        const std::string bytes = fixture(names[i]);
+        const std::string bytes = hdf5_bytes(names[i]);
         CHECK_EQUAL(int{bytes[8]}, versions[i]);
         check_contents(names[i], parse(bytes), i == 0 || i == 3 ? 9 : 1);
     }
 }
 
 TEST(hdf5_files_of_d4rl_are_read) {
-    const Hdf5File file = parse(fixture("d4rl-1.12"));
+    const Hdf5File file = parse(hdf5_bytes("d4rl-1.12"));
     check_contents("d4rl", file, 14);
     CHECK(file.find("observations")->shape == (Shape{700, 11}));
     CHECK(file.find("observations")->filters == std::vector{Hdf5Filter::deflate});
@@ -437,7 +430,7 @@ TEST(hdf5_files_of_d4rl_are_read) {
 }
 
 TEST(hdf5_files_of_minari_are_read) {
-    const Hdf5File file = parse(fixture("minari"));
+    const Hdf5File file = parse(hdf5_bytes("minari"));
     check_contents("minari", file, 72);
     for (size_t e = 0; e < 12; ++e) {
         const Hdf5Dataset* dataset = file.find("episode_" + std::to_string(e) + "/infos/qpos");
@@ -446,7 +439,7 @@ TEST(hdf5_files_of_minari_are_read) {
 }
 
 TEST(hdf5_damage_that_a_checksum_covers_is_found) {
-    const std::string latest = fixture("latest");
+    const std::string latest = hdf5_bytes("latest");
     const Hdf5File file = parse(latest);
     const auto damaged = [&](uint64_t at) {
         std::string bytes = latest;
@@ -462,7 +455,7 @@ TEST(hdf5_damage_that_a_checksum_covers_is_found) {
     const Hdf5Chunk& chunk = file.find("filters/sd")->chunks[0];
     CHECK_FAILS("hdf5.deflate", const Hdf5File f = damaged(chunk.address + chunk.size - 1);
                 f.read<float>(*f.find("filters/sd")));
-    const std::string small = fixture("small_latest");
+    const std::string small = hdf5_bytes("small_latest");
     const auto structures = checksummed(small);
     CHECK(structures.size() > 15);
     for (const auto& [begin, end] : structures) {
@@ -483,7 +476,7 @@ TEST(hdf5_damage_that_a_checksum_covers_is_found) {
 
 TEST(hdf5_files_cut_off_anywhere_give_errors) {
     for (const char* name : {"small_old", "small_latest"}) {
-        const std::string whole = fixture(name);
+        const std::string whole = hdf5_bytes(name);
         const bool old = whole[8] == 0;
         for (size_t size = 0; size < whole.size(); ++size) {
             std::string cut = whole.substr(0, size);
@@ -501,7 +494,7 @@ TEST(hdf5_files_changed_at_random_give_errors_or_values) {
     uint64_t step = 0;
     for (const char* name :
          {"small_old", "small_latest", "minari", "superblock2", "root_old", "root_latest", "tables"}) {
-        const std::string whole = fixture(name);
+        const std::string whole = hdf5_bytes(name);
         const auto structures = checksummed(whole);
         std::vector<uint64_t> addresses = {undefined_address, whole.size() - 1, uint64_t{1} << 63, 0};
         std::vector<size_t> pointers;
@@ -640,7 +633,7 @@ TEST(hdf5_circles_end_in_errors) {
 
 // Files that a writer could not make, with checksums that hold.
 TEST(hdf5_blocks_too_small_and_layouts_that_come_twice_are_refused) {
-    std::string bytes = fixture("small_latest");
+    std::string bytes = hdf5_bytes("small_latest");
     const size_t heap = bytes.find("FRHP");
     CHECK(heap != std::string::npos);
     const auto structures = checksummed(bytes);
@@ -669,7 +662,7 @@ TEST(hdf5_blocks_too_small_and_layouts_that_come_twice_are_refused) {
 // The implicit index of [7, 5] values in chunks [2, 3] that may grow to [7, 2^64 - 2]: its last chunk's number,
 // 3 (2^64 - 1) / 3 + 1, is 2^64, of which 64 bits leave 0.
 TEST(hdf5_index_whose_last_number_overflows_is_refused) {
-    std::string bytes = fixture("latest");
+    std::string bytes = hdf5_bytes("latest");
     const auto structures = checksummed(bytes);
     std::string shape;
     for (const uint64_t extent : {7, 5, 7, 8}) shape.append(reinterpret_cast<const char*>(&extent), 8);
@@ -818,7 +811,7 @@ long kilobytes(const std::string& which) {
 
 TEST(hdf5_faults_published_of_the_library_are_refused_in_time_and_memory) {
     for (const auto& [name, faults] : published_faults) {
-        const std::string whole = fixture(name);
+        const std::string whole = hdf5_bytes(name);
         const auto structures = checksummed(whole);
         CHECK_EQUAL(refusal(whole), "");
         for (const auto& [kind, letters, skip, bytes, said] : faults) {
@@ -837,5 +830,5 @@ TEST(hdf5_faults_published_of_the_library_are_refused_in_time_and_memory) {
         }
     }
     // The function alone: a file with so short a chunk could harm other readers.
-    CHECK_FAILS("hdf5.checksum", Hdf5File::without_checksum(as_bytes(fixture("small_old")).first(3)));
+    CHECK_FAILS("hdf5.checksum", Hdf5File::without_checksum(as_bytes(hdf5_bytes("small_old")).first(3)));
 }

@@ -1,6 +1,5 @@
 // test_vectors.cpp: golden vectors hold, a wrong expected value does not, and what is no file of vectors is refused.
 #include <dirent.h>
-#include <fcntl.h>
 #include <unistd.h>
 
 #include <algorithm>

@@ -9,6 +9,7 @@
 #define WODTEM_NO_MAIN
 #include "../wodtem.cpp"
 #include "fuzz.cpp"
+#include "hdf5_files.hpp"
 #include "test.hpp"
 
 namespace {
@@ -1072,22 +1073,22 @@ std::pair<double, int> signalled(const Settings& settings, const std::string& fo
         _exit(0);
     }
     clockid_t clock = 0;
-    timespec before = {};
     clock_getcpuclockid(child, &clock);
-    const auto used = [&] {
-        clock_gettime(clock, &before);
-        return static_cast<double>(before.tv_sec) + 1e-9 * static_cast<double>(before.tv_nsec);
+    const auto used = [&] {  // seconds of the child's processor time
+        timespec now = {};
+        clock_gettime(clock, &now);
+        return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
     };
     for (int i = 0; i < 100000 && !fs::exists(folder + "/" + file); ++i) usleep(1000);
     const double at_file = used();
     for (int i = 0; i < 100000 && used() < at_file + 0.1; ++i) usleep(1000);
+    const double before = used();
     kill(child, signal);
     int status = 0;
     rusage usage = {};
     wait4(child, &status, 0, &usage);
-    const double seconds = static_cast<double>(usage.ru_utime.tv_sec + usage.ru_stime.tv_sec - before.tv_sec) +
-                           1e-6 * static_cast<double>(usage.ru_utime.tv_usec + usage.ru_stime.tv_usec) -
-                           1e-9 * static_cast<double>(before.tv_nsec);
+    const double seconds = static_cast<double>(usage.ru_utime.tv_sec + usage.ru_stime.tv_sec) +
+                           1e-6 * static_cast<double>(usage.ru_utime.tv_usec + usage.ru_stime.tv_usec) - before;
     return {seconds, WEXITSTATUS(status)};
 }
 }  // namespace
@@ -3030,11 +3031,8 @@ TEST(inputs_of_the_fuzz_targets_end_in_a_value_or_an_error) {
     for (const char* file : {"settings", "progress.csv", "episodes.csv", "policy.csv", "start_actions.csv"})
         report += read_file(scratch / ("run/" + std::string(file))) + '\0';
     for (const char* target : {"safetensors", "model", "import"}) inputs.emplace_back(target, model);
-    for (const char* name : {"root_old", "root_latest", "shared", "peers_latest"}) {  // the size, then a zlib stream
-        const std::string packed = read_file("tests/hdf5/" + std::string(name) + ".z");
-        const auto whole = inflate_zlib(as_bytes(packed).subspan(8), little_endian(as_bytes(packed).first(8)));
-        inputs.emplace_back("hdf5", std::string(whole.begin(), whole.end()));
-    }
+    for (const char* name : {"root_old", "root_latest", "shared", "peers_latest"})
+        inputs.emplace_back("hdf5", hdf5_bytes(name));
     inputs.emplace_back("checkpoint", checkpoint);
     inputs.emplace_back("report", report);
     inputs.emplace_back("settings", settings_text(settings));
