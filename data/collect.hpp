@@ -427,8 +427,8 @@ inline void collect(const std::string& id, const std::string& out, int64_t steps
         std::vector<std::string> names = {walker_name};
         for (const PublishedDataSet& one : published_data_sets)
             if (one.steps > 0) names.push_back(one.id);
-        fail("usage.task", "collect makes stand-ins for the paper's data sets, and \"%s\" is none%s", id.c_str(),
-             nearest_hint(id, names).c_str());
+        fail("usage.task", "collect makes stand-ins for the paper's data sets, and \"%s\" is none%s",
+             excerpt(id).c_str(), nearest_hint(id, names).c_str());
     }
     require(!walker || steps == 0, "usage.option", "collect ", id,
             " trains a policy and makes no rows; leave --steps out");

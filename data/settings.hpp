@@ -76,14 +76,17 @@ inline std::vector<double> numbers_between_commas(const std::string& line, const
     return values;
 }
 
+// A text as a sentence quotes it: no more than its first 200 bytes.
+inline std::string excerpt(const std::string& text) { return text.size() > 200 ? text.substr(0, 200) + "..." : text; }
+
 // The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest
 // number in it; `name` begins the sentence.
 inline double number_in(const std::string& text, const char* id, const char* name, auto low, auto high, bool whole) {
     const double least = static_cast<double>(low), most = static_cast<double>(high);
     const std::optional<double> x = to_number(text);
     const double within = std::clamp(x.value_or(least), least, most), nearest = whole ? std::round(within) : within;
-    require(x == nearest, id, name, " cannot be \"", text, "\"; it is a ", whole ? "whole " : "", "number from ",
-            number_text(low), " to ", number_text(high),
+    require(x == nearest, id, name, " cannot be \"", excerpt(text), "\"; it is a ", whole ? "whole " : "",
+            "number from ", number_text(low), " to ", number_text(high),
             x ? "; the nearest is " + number_text(static_cast<decltype(low)>(nearest)) : "");
     return *x;
 }
@@ -118,8 +121,10 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
 }
 
 // '; the nearest is "NAME"' for the end of a sentence; nothing where none of the names is near: where more than half of
-// the letters would have to change, and neither is a part of the other.
+// the letters would have to change, and neither is a part of the other; or where the text is so long that looking takes
+// long.
 inline std::string nearest_hint(const std::string& name, const std::vector<std::string>& names) {
+    if (name.size() > 200) return "";
     const std::string nearest = nearest_name(name, names);
     const bool part = nearest.find(name) != std::string::npos || name.find(nearest) != std::string::npos;
     const size_t longer = std::max(name.size(), nearest.size());
@@ -135,7 +140,7 @@ inline const auto& row_named(const auto& rows, const std::string& name, const ch
         if (name == row.name) return row;
         names.push_back(row.name);
     }
-    fail(id, sentence.c_str(), name.c_str(), nearest_hint(name, names).c_str());
+    fail(id, sentence.c_str(), excerpt(name).c_str(), nearest_hint(name, names).c_str());
 }
 
 // The index of `name` among an enumeration's names, which hold it.
@@ -415,13 +420,14 @@ inline std::string setting_text(const Settings& settings, const SettingRow& row)
 inline void parse_value(const SettingRow& row, const std::string& text, std::string& value) {
     const std::vector<std::string> choices = split(row.choices, '|');
     if (*row.choices != 0 && !contains(choices, text))
-        fail("usage.setting", "%s cannot be \"%s\"; it is one of %s%s", row.name, text.c_str(), row.choices,
+        fail("usage.setting", "%s cannot be \"%s\"; it is one of %s%s", row.name, excerpt(text).c_str(), row.choices,
              nearest_hint(text, choices).c_str());
     value = text;
 }
 
 inline void parse_value(const SettingRow& row, const std::string& text, bool& value) {
-    require(text == "yes" || text == "no", "usage.setting", row.name, " cannot be \"", text, "\"; it is yes or no");
+    require(text == "yes" || text == "no", "usage.setting", row.name, " cannot be \"", excerpt(text),
+            "\"; it is yes or no");
     value = text == "yes";
 }
 
@@ -574,6 +580,7 @@ struct Setting {
 // settings.repeated.
 inline std::vector<Setting> parse_settings(const std::string& text, const std::string& path) {
     std::vector<Setting> out;
+    std::set<std::string> names;
     size_t line = 0;
     for (const std::string& all : split(text, '\n')) {
         ++line;
@@ -585,9 +592,9 @@ inline std::vector<Setting> parse_settings(const std::string& text, const std::s
                        trimmed(all.substr(hash + 2))};
         const bool complete = !setting.name.empty() && !setting.value.empty() && !setting.source.empty();
         require(complete, "settings.line", path, ": line ", line, ": expected \"name = value    # source\", got \"",
-                trimmed(all), "\"");
-        require(std::ranges::find(out, setting.name, &Setting::name) == out.end(), "settings.repeated", path, ": line ",
-                line, ": \"", setting.name, "\" was set before; keep one of the lines");
+                excerpt(trimmed(all)), "\"");
+        require(names.insert(setting.name).second, "settings.repeated", path, ": line ", line, ": \"",
+                excerpt(setting.name), "\" was set before; keep one of the lines");
         setting.value = unquoted(setting.value);
         out.push_back(setting);
     }

@@ -332,6 +332,23 @@ TEST(bad_settings_are_usage_errors_that_name_the_nearest) {
     }
 }
 
+// A megabyte of one word, and of lines with a name each: refused in a moment, in a sentence that can be read.
+TEST(settings_of_a_megabyte_are_refused_at_once_and_in_few_words) {
+    const std::string word(1 << 20, 'x');
+    std::string lines;
+    for (int i = 0; lines.size() < 1 << 20; ++i) lines += std::to_string(i) + " = 1 # s\n";
+    const std::clock_t began = std::clock();
+    for (const std::string& text : {word + " = 1 # s", "sampling = " + word + " # s", "position = " + word + " # s",
+                                    "K = " + word + " # s", word, lines})
+        try {
+            settings_from_text(text, "file");
+            report_failure(__FILE__, __LINE__, "not refused: " + text.substr(0, 20));
+        } catch (const Error& error) {
+            CHECK(std::string(error.what()).size() < 500);
+        }
+    CHECK(std::clock() - began < CLOCKS_PER_SEC);
+}
+
 // ---------------------------------------------------------------------------------------------------------------------
 // Objective
 
