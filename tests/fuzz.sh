@@ -2,7 +2,8 @@
 # Fuzzing with libFuzzer: `make fuzz` calls this from the root of the repository, first as
 #   fuzz.sh build CLANG++ FLAGS...   makes build/fuzz/fuzz of tests/fuzz.cpp, with the sanitizers for addresses and
 #                                    undefined behaviour
-#   fuzz.sh run SECONDS TARGET...    runs each target that long, without TARGET all, and prints a line for each
+#   fuzz.sh run SECONDS TARGET...    runs each target that long, without TARGET all, and prints a line for each;
+#                                    MAX_LEN=BYTES bounds the inputs, which by default are as long as the longest seed
 # In the copy that is built no checksum is compared: what a checksum would refuse is what the code behind it shall meet.
 # The corpus stays in build/fuzz and grows from run to run; what is found lies in build/fuzz/found. To keep a finding,
 # copy it to tests/fuzz/TARGET-WHAT: the tests replay what is there. Exit status 1 if anything was found.
@@ -94,7 +95,7 @@ for target; do
     mkdir -p corpus/$target
     status=0
     FUZZ_TARGET=$target "$fuzz" corpus/$target seeds/$target -dict=words -max_total_time="$seconds" -timeout=1 \
-        -malloc_limit_mb=256 -rss_limit_mb=1024 -print_final_stats=1 -artifact_prefix=found/$target- \
+        -max_len="${MAX_LEN:-0}" -malloc_limit_mb=256 -rss_limit_mb=1024 -print_final_stats=1 -artifact_prefix=found/$target- \
         > log-$target 2>&1 || status=$?
     line=$(grep -a 'cov: ' log-$target | tail -n 1)
     finding=
