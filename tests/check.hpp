@@ -1626,6 +1626,76 @@ void check_step(Case& c) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// Topic: whole runs
+
+// Preset small's settings of the grid world, changed by the entries CASE.NAME. Errors: usage.setting; check.value for a
+// run that takes long, because rounding grows from update to update, and vectors come from anywhere.
+Settings run_settings(Case& c) {
+    Settings settings = default_settings("gridworld", c.word("method", "wodtem|odt|dt"), "small");
+    std::vector<std::string> assignments;
+    for (const SettingRow& row : setting_rows) {
+        const std::string value = c.metadata_or(row.name, "");
+        if (value.empty() || contains(not_for_set, row.name)) continue;
+        c.used.insert(c.name + "." + row.name);
+        assignments.push_back(std::string(row.name) + "=" + value);
+    }
+    apply_assignments(settings, assignments);
+    settings.seed = c.whole("seed", 0, 0, 0xFFFFFFFF);
+    check_together(settings);
+    // At most so many updates and tokens, for episodes of 5 steps in the online phase and of 100 in evaluations.
+    const double episodes = std::ceil(static_cast<double>(settings.online_steps) / 5);
+    const double updates =
+        static_cast<double>(settings.offline_updates) + episodes * static_cast<double>(settings.updates_per_iteration);
+    const double evaluations = 1 + episodes / static_cast<double>(settings.eval_every);
+    const double steps = updates * static_cast<double>(settings.batch_size * settings.context_length) +
+                         (5 * episodes + 100 * evaluations * static_cast<double>(settings.eval_episodes)) *
+                             static_cast<double>(std::min(settings.eval_context, settings.context_length));
+    const double width = static_cast<double>(settings.width),
+                 longest = static_cast<double>(3 * settings.context_length);
+    const double products = 3 * steps * static_cast<double>(settings.layers) * width * (12 * width + 2 * longest);
+    c.require_value(updates <= 1000 && products <= 2e9, "makes up to ", updates, " updates and ", products,
+                    " multiplications, expected at most 1000 and 2e9");
+    c.require_value(settings.data_trajectories <= 1000 && settings.table_size <= 1000, "has ",
+                    settings.data_trajectories, " trajectories and ", settings.table_size,
+                    " entries, expected at most 1000 of each");
+    return settings;
+}
+
+// The lines of a log, as lists by column: numbers, NaN where there is none.
+void add_columns(std::map<std::string, std::vector<double>>& columns, const std::string& header,
+                 const std::string& line) {
+    const std::vector<std::string> names = split(trimmed(header), ','), fields = split(trimmed(line), ',');
+    for (size_t i = 0; i < names.size(); ++i) {
+        std::vector<double>& column = columns[names[i]];
+        if (names[i] == "actions")
+            for (const char move : fields[i]) column.push_back(move - '0');
+        else
+            column.push_back(to_number(fields[i]).value_or(NAN));
+    }
+}
+
+// A run from its data set to its last evaluation. -> progress/NAME [evaluations], episodes/NAME [episodes]: columns of
+// progress.csv and episodes.csv, as they would be written; episodes/actions [interactions].
+void check_run(Case& c) {
+    const Settings settings = run_settings(c);
+    std::map<std::string, std::vector<double>> progress, episodes;
+    Observer observer;
+    observer.evaluated = [&](const ProgressRow& row, const Evaluation&) {
+        add_columns(progress, progress_header, progress_line(row, settings));
+    };
+    observer.played = [&](const EpisodeRow& row) {
+        add_columns(episodes, episodes_header, episode_line(row, settings));
+    };
+    observer.pause = [](double) {};
+    Run run(c.compute, settings, *make_environment(settings));
+    begin_run(run, make_data_set(settings));
+    offline_phase(run, observer);
+    if (settings.online_steps > 0) online_phase(run, observer);
+    for (const auto& [name, column] : progress) c.expect("progress/" + name, shape_of(column.size()), column, true);
+    for (const auto& [name, column] : episodes) c.expect("episodes/" + name, shape_of(column.size()), column, true);
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
 // Topics: the MuJoCo tasks
 
 // qpos [m, nq], qvel [m, nv], actions [m, A] or [m, T, A]: T steps from each state, after a reset; goal [2], physics.
@@ -1711,6 +1781,7 @@ constexpr Topic topics[] = {
     {"normalize", nullptr, check_normalize},
     {"gridworld", check_gridworld, nullptr},
     {"step", check_step<double>, check_step<float>},
+    {"run", nullptr, check_run},
     {"env_", check_environment, nullptr},
 };
 

@@ -262,7 +262,8 @@ TEST(every_topic_has_its_file_and_all_together_are_below_a_megabyte) {
                                        "sampling",
                                        "normalize",
                                        "gridworld",
-                                       "step"};
+                                       "step",
+                                       "run"};
     for (const MujocoTask& task : mujoco_tasks)
         if (std::string(task.name) != "antmaze-umaze-diverse") topics.push_back(std::string("env_") + task.name);
     size_t bytes = 0;
@@ -478,6 +479,36 @@ TEST(settings_and_sizes_of_a_vector_are_held_to_their_ranges) {
     step.add("a/in/parameter/transformer.h.0.attn.c_attn.weight", {1, 3}, std::array{1.0f, 1.0f, 1.0f});
     step.add("a/out/loss", {}, std::array{0.0f});
     CHECK_FAILS("check.shape", check(step));
+}
+
+TEST(a_run_of_vectors_takes_the_settings_of_train_within_bounds) {
+    TensorFile run = hand_made("run");
+    run.metadata.insert({{"a.method", "odt"}, {"a.offline_updates", "3"}, {"a.online_steps", "0"}});
+    run.add("a/out/progress/updates", {1}, std::array{3.0});
+    CHECK(check(run).holds);
+    const auto with = [&](const char* key, const char* text) {
+        TensorFile file = run;
+        file.metadata[key] = text;
+        return file;
+    };
+    CHECK(!check(with("a.offline_updates", "4")).holds);
+    for (const auto& [key, text] : {std::pair{"a.offline_updates", "1001"},
+                                    {"a.width", "4096"},
+                                    {"a.online_steps", "200000"},
+                                    {"a.batch_size", "1000000"},
+                                    {"a.eval_episodes", "1000000"},
+                                    {"a.seed", "-1"},
+                                    {"a.data_trajectories", "1001"},
+                                    {"a.table_size", "1001"},
+                                    {"a.method", "ppo"}})
+        CHECK_FAILS("check.value", check(with(key, text)));
+    for (const auto& [key, text] :
+         {std::pair{"a.K", "0"}, {"a.sampling", "all"}, {"a.heads", "3"}, {"a.method", "dt"}}) {
+        TensorFile file = with(key, text);
+        if (key == std::string("a.method")) file.metadata["a.online_steps"] = "100";
+        CHECK_FAILS("usage.setting", check(file));
+    }
+    for (const char* key : {"a.task", "a.dataset", "a.colour"}) CHECK_FAILS("check.unknown", check(with(key, "data")));
 }
 
 TEST(damaged_vectors_never_crash) {

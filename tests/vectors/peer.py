@@ -3,8 +3,8 @@
 
 It shares no code with the project: equations written again, in NumPy and PyTorch, in float64, in the plainest form that
 each has, with gradients by PyTorch's autograd; the physics by MuJoCo's own library through a few lines of C. The files
-were made on 2026-11-24 and 2026-11-29 by Debian 12's python3 3.11.2, python3-numpy 1.24.2, python3-torch 1.13.0a0 and
-libmujoco 2.2.2:
+were made on 2026-11-24, 2026-11-29 and 2026-12-01 by Debian 12's python3 3.11.2, python3-numpy 1.24.2, python3-torch
+1.13.0a0 and libmujoco 2.2.2:
 
     python3 tests/vectors/peer.py            # writes every file beside it
     python3 tests/vectors/peer.py linear     # or those named
@@ -129,9 +129,14 @@ class Draw:
         w = self.words(step, index, site)
         return math.sqrt(-2 * math.log(((w[2] >> 8) + 1) / 2.0**24)) * math.cos((w[3] >> 8) / 2.0**24 * 2 * math.pi)
 
+    def below(self, bound, step, index, site=0):
+        w = self.words(step, index, site)
+        return (w[1] << 32 | w[0]) * bound >> 64
+
     def dropout(self, probability, step, site, element):
-        word = self.words(step, element // 4, site)[element % 4]
-        return 0.0 if word < int(probability * 2**32) else 1 / (1 - probability)
+        """element: an array of whole numbers."""
+        word = np.choose(element % 4, self.words(step, np.uint64(element // 4), site))
+        return np.where(word < int(probability * 2**32), 0.0, 1 / (1 - probability))
 
 
 NORMAL = 8 * 2 * math.pi * U  # of Draw.normal in float32: the angle, up to 2 pi, is rounded three times
@@ -462,17 +467,16 @@ class Mask:
 
     def of_tokens(self, window, site, d):
         mask = np.ones((3 * self.lengths[window], d))
-        for token, row in self.rows(window, site):
-            mask[token] = [self.factor(site, row * d + j) for j in range(d)]
+        token, row = np.array(self.rows(window, site)).T
+        mask[token] = self.factor(site, row[:, None] * d + np.arange(d))
         return torch.tensor(mask)
 
     def of_weights(self, window, site):
         tokens, longest = 3 * self.lengths[window], 3 * max(self.lengths) - 1
         mask = np.ones((self.heads, tokens, tokens))
-        for token, row in self.rows(window, site):
-            for h in range(self.heads):
-                mask[h, token, :token + 1] = [
-                    self.factor(site, (row * self.heads + h) * longest + key) for key in range(token + 1)]
+        token, row = np.array(self.rows(window, site)).T
+        head = np.arange(self.heads)[:, None, None]  # keys behind the token get a factor, too, and have the weight 0
+        mask[:, token] = self.factor(site, (row[:, None] * self.heads + head) * longest + np.arange(tokens))
         return torch.tensor(mask)
 
 
@@ -540,40 +544,48 @@ def split_windows(lengths, *arrays):
             for n, e in zip(lengths, ends)]
 
 
+def start_values(seed, state_dim, action_dim, layers, d, head, positions=0):
+    draw, p = Draw(seed, 1), {}
+    for number, (key, shape) in enumerate(parameter_shapes(state_dim, action_dim, layers, d, head,
+                                                           positions).items()):
+        kind, n = key.rsplit(".", 1)[1], int(np.prod(shape))
+        normal = lambda: np.array([draw.normal(number, i) for i in range(n)]).reshape(shape)
+        orthogonal = "predict_action" in key and head != "deterministic"
+        if "ln_" in key or "embed_ln" in key:
+            p[key] = np.full(shape, 1.0 if kind == "weight" else 0.0)
+        elif key == "embed_ordering.weight":
+            p[key] = normal()
+        elif key.startswith("transformer."):
+            p[key] = 0.02 * normal() if kind == "weight" else np.zeros(shape)
+        elif orthogonal:
+            p[key] = np.zeros(shape)
+            for i, row in enumerate(normal() if kind == "weight" else ()):
+                for other in p[key][:i]:
+                    row = row - (row @ other) * other
+                p[key][i] = row / np.sqrt(row @ row)
+        else:
+            fan_in = {"embed_return": 1, "embed_state": state_dim, "embed_action": action_dim}.get(
+                key.split(".")[0], d)
+            p[key] = np.array([(2 * draw.uniform(number, i) - 1) / math.sqrt(fan_in) for i in range(n)
+                              ]).reshape(shape)
+    return p
+
+
+def start_projection(seed, projected_dim, state_dim):
+    return np.array([Draw(seed, 8).normal(0, i) / math.sqrt(projected_dim) for i in range(projected_dim * state_dim)
+                    ]).reshape(projected_dim, state_dim)
+
+
 def initialisation():
     f = File("initialisation", "none: ODT's start values, from the seed")
 
     def case(name, note, seed, state_dim, action_dim, layers, d, head, positions=0, projected_dim=0):
-        draw, p = Draw(seed, 1), {}
-        for number, (key, shape) in enumerate(parameter_shapes(state_dim, action_dim, layers, d, head,
-                                                               positions).items()):
-            kind, n = key.rsplit(".", 1)[1], int(np.prod(shape))
-            normal = lambda: np.array([draw.normal(number, i) for i in range(n)]).reshape(shape)
-            orthogonal = "predict_action" in key and head != "deterministic"
-            if "ln_" in key or "embed_ln" in key:
-                p[key] = np.full(shape, 1.0 if kind == "weight" else 0.0)
-            elif key == "embed_ordering.weight":
-                p[key] = normal()
-            elif key.startswith("transformer."):
-                p[key] = 0.02 * normal() if kind == "weight" else np.zeros(shape)
-            elif orthogonal:
-                p[key] = np.zeros(shape)
-                for i, row in enumerate(normal() if kind == "weight" else ()):
-                    for other in p[key][:i]:
-                        row = row - (row @ other) * other
-                    p[key][i] = row / np.sqrt(row @ row)
-            else:
-                fan_in = {"embed_return": 1, "embed_state": state_dim, "embed_action": action_dim}.get(
-                    key.split(".")[0], d)
-                p[key] = np.array([(2 * draw.uniform(number, i) - 1) / math.sqrt(fan_in) for i in range(n)
-                                  ]).reshape(shape)
+        p = start_values(seed, state_dim, action_dim, layers, d, head, positions)
         outputs = {"parameter/" + key: value for key, value in p.items()}
         settings = {"seed": seed, "state_dim": state_dim, "action_dim": action_dim, "layers": layers, "width": d,
                     "head": head, "positions": positions}
         if projected_dim:
-            outputs["projection"] = np.array([
-                Draw(seed, 8).normal(0, i) / math.sqrt(projected_dim) for i in range(projected_dim * state_dim)
-            ]).reshape(projected_dim, state_dim)
+            outputs["projection"] = start_projection(seed, projected_dim, state_dim)
             settings["projected_dim"] = projected_dim
         f.case(name, note, f"float32 {NORMAL:.2g}: normals as in rng, uniform numbers are rounded once",
                NUMPY + ", Python's whole numbers", {}, outputs, **settings)
@@ -1761,6 +1773,277 @@ def step():
 
 
 # ----------------------------------------------------------------------------------------------------------------------
+# run: whole runs on the grid world, one window, one look-up, one step at a time.
+
+SMALL = {  # preset small, of all methods, but for DT's online_steps 0
+    "seed": 0, "data_seed": 138129, "data_trajectories": 500, "behaviour": "right_down", "edge": "clipped",
+    "state_encoding": "coordinates", "layers": 1, "heads": 1, "width": 8, "context_length": 1, "eval_context": 5,
+    "position": "no", "dropout": 0.1, "optimizer": "lamb", "learning_rate": 0.001, "weight_decay": 0,
+    "clip_norm": 0.25, "lamb_always_adapt": "no", "warmup_updates": 10000, "batch_size": 256, "offline_updates": 1000,
+    "updates_per_iteration": 50, "initial_lambda": 0.1, "lambda_learning_rate": 1e-4, "eta": -1, "online_steps": 20000,
+    "buffer_size": 500, "eval_episodes": 1, "eval_every": 10, "g_online": 2, "g_eval": 1, "reward_scale": 1,
+    "keep_lowest": "no", "sampling": "uniform", "gamma": 0.99, "alpha": 0.75, "epsilon": 0.1, "tau": 1, "K": 1,
+    "projected_dim": 0, "table_size": 36, "keys": "raw", "eviction": "lfu", "exclude_self": "no"}
+
+
+# The three choices of a run that are made by numbers. None is so close that rounding in float32 could turn it.
+
+
+def drawn(uniform, odds, actions, near=1e-4):
+    """The action whose share of [0, 1) contains the number."""
+    ends = np.cumsum(odds)[:-1] / np.sum(odds)
+    found = [actions[np.searchsorted(ends, uniform + x, side="right")] for x in (0.0, -near, near)]
+    assert found[0] == found[1] == found[2]
+    return found[0]
+
+
+def most_likely(log_p):
+    assert np.sort(log_p)[-1] - np.sort(log_p)[-2] > 1e-4
+    return int(np.argmax(log_p))
+
+
+def falls_short(found, d):
+    """d below e-hat, as a sum of differences."""
+    excess = sum(math.exp(found[0][0] - q) * (entry["e"] - d) for q, entry in found)
+    assert excess == 0 or abs(excess) > 1e-5
+    return excess > 0
+
+
+def grid_episode(choose, edge):
+    """From the top left to the goal, 100 steps at most. choose: from the episode so far, its last cell the present one,
+    to a move."""
+    e = {"cells": [0], "moves": [], "rewards": []}
+    while len(e["moves"]) < 100 and e["cells"][-1] != 35:
+        e["moves"].append(choose(e))
+        e["cells"].append(grid_next(e["cells"][-1], e["moves"][-1], edge))
+        e["rewards"].append(float(e["cells"][-1] == 35))
+    return e
+
+
+class Run:
+    """All that happens in a run, by the names and values of its settings."""
+
+    def __init__(self, **s):
+        self.s = s
+        self.memory = s["method"] == "wodtem"
+        draw = Draw(s["data_seed"], 9)
+
+        def behave(n, e):
+            cell = e["cells"][-1]
+            odds = np.array([2 if m in (0 if s["behaviour"] == "right_down" else 2, 1) else 1 for m in range(8)])
+            if s["edge"] == "excluded":
+                odds *= [grid_next(cell, m, "stays") != cell for m in range(8)]
+            return int(np.searchsorted(np.cumsum(odds), draw.below(int(odds.sum()), n, len(e["moves"])), side="right"))
+        data = [grid_episode(lambda e: behave(n, e), s["edge"]) for n in range(s["data_trajectories"])]
+        states = np.concatenate([self.states(e["cells"][:-1]) for e in data])
+        self.mean, self.deviation = states.mean(0), states.std(0) + 1e-6
+        ranked = sorted(data, key=lambda e: sum(e["rewards"]))  # stable: of equal returns in the data's order
+        if s["keep_lowest"] == "no":
+            data = [e for e in data if e is not ranked[0]]
+            ranked = ranked[1:]
+        S = states.shape[1]
+        self.p = {k: torch.tensor(np.float64(np.float32(v)), requires_grad=True) for k, v in start_values(
+            s["seed"], S, 8, s["layers"], s["width"], "categorical", 1000 * (s["position"] == "yes")).items()}
+        self.theta = PeerOptimizer(s["optimizer"], s["learning_rate"], s["weight_decay"], s["clip_norm"],
+                                   s["warmup_updates"], always=s["lamb_always_adapt"] == "yes")
+        self.log_lambda = {"": np.array([float(np.float32(math.log(s["initial_lambda"])))])}
+        self.temperature = PeerOptimizer("adamw", s["lambda_learning_rate"], clip=0)
+        projection = start_projection(s["seed"], s["projected_dim"], S) if s["projected_dim"] else None
+        self.table = Table(s["table_size"], s["K"], s["epsilon"], s["eviction"], projection, s["exclude_self"] == "yes")
+        self.buffer, self.updates, self.interactions, self.episodes = ranked, 0, 0, []
+        self.rows, self.since, self.changes = [], [], np.zeros(4, dtype=int)
+        for e in data:
+            self.take_in(e)
+
+    def go(self):
+        s, place = self.s, 0
+        for _ in range(s["offline_updates"]):
+            self.update()
+        self.evaluate()
+        self.buffer = self.buffer[-s["buffer_size"]:]
+        while self.interactions < s["online_steps"]:
+            e = self.act(s["g_online"], Draw(s["seed"], 4), len(self.episodes))
+            self.interactions += len(e["moves"])
+            self.episodes.append(dict(e, interactions=self.interactions))
+            self.take_in(e)
+            if len(self.buffer) < s["buffer_size"]:
+                self.buffer.append(e)
+            else:
+                self.buffer[place] = e
+                place = (place + 1) % s["buffer_size"]
+            for _ in range(s["updates_per_iteration"]):
+                self.update()
+            if len(self.episodes) % s["eval_every"] == 0 or self.interactions >= s["online_steps"]:
+                self.evaluate()
+        return self
+
+    def states(self, cells):
+        if self.s["state_encoding"] == "one_hot":
+            return np.eye(36)[cells]
+        return np.stack([np.array(cells) // 6, np.array(cells) % 6], 1).astype(np.float64)
+
+    def normalised(self, cells):
+        y = (np.float32(self.states(cells)) - np.float32(self.mean)) / np.float32(self.deviation)
+        return y.astype(np.float64)
+
+    def keys(self, cells):
+        return self.normalised(cells) if self.s["keys"] == "normalized" else self.states(cells)
+
+    def take_in(self, e):
+        """The memory; the buffer is the caller's."""
+        e["d"] = sums(e["rewards"], self.s["gamma"])
+        if self.memory:
+            for key, move, d in zip(self.keys(e["cells"][:-1]), e["moves"], e["d"]):
+                self.table.update(self.table.clock, key, move, d)
+
+    def draw_window(self, i):
+        """Episode, first step, steps."""
+        chance, starts = Draw(self.s["seed"], 3), [(e, t) for e in self.buffer for t in range(len(e["moves"]))]
+        if self.s["sampling"] == "by_length":
+            e, t = starts[chance.below(len(starts), self.updates, i)]
+        else:
+            e = self.buffer[chance.below(len(self.buffer), self.updates, i)]
+            t = chance.below(len(e["moves"]), self.updates, i, 1)
+        return e, t, min(self.s["context_length"], len(e["moves"]) - t)
+
+    def update(self):
+        s, B, C = self.s, self.s["batch_size"], self.s["context_length"]
+        windows = [self.draw_window(i) for i in range(B)]
+        lengths = [n for _, _, n in windows]
+        gather = lambda of: np.concatenate([np.array(of(e))[t:t + n] for e, t, n in windows])
+        moves, d = gather(lambda e: e["moves"]), gather(lambda e: e["d"])
+        time = gather(lambda e: np.arange(len(e["moves"])))
+        R = gather(lambda e: sums(e["rewards"], 1.0) * s["reward_scale"])
+        row = {"learning_rate": s["learning_rate"] * min(1.0, (self.updates + 1) / max(1, s["warmup_updates"]))}
+
+        remembered, w, short, accessed = moves.copy(), np.ones(len(moves)), np.zeros(len(moves), dtype=bool), []
+        if self.memory:
+            cells, uniform = gather(lambda e: e["cells"][:-1]), Draw(s["seed"], 5)
+            place = np.concatenate([i * C + np.arange(n) for i, n in enumerate(lengths)])
+            nearest = {cell: self.table.nearest(self.keys([cell])[0]) for cell in set(cells)}
+            row["unmatched"] = [not nearest[cell] for cell in cells]
+            for j, cell in enumerate(cells):
+                found = nearest[cell]
+                accessed += [entry for _, entry in found]
+                if falls_short(found, d[j]):
+                    short[j] = True
+                    remembered[j] = drawn(uniform.uniform(self.updates, int(place[j])),
+                                          [math.exp(entry["e"] / s["tau"]) for _, entry in found],
+                                          [entry["action"] for _, entry in found], near=1e-5)
+            w[short] = s["alpha"]
+            row["short"] = short
+            c = (1 - w) / (B * np.repeat(lengths, lengths))
+            row["advice"], row["advice_distance"] = c.sum(), c[remembered != moves].sum()
+            row["shift"] = np.bincount(remembered, c, 8) - np.bincount(moves, c, 8)
+
+        P, policy = -(-B // max(1, 2048 // (3 * C))), []
+        batch = split_windows(lengths, R, self.normalised(gather(lambda e: e["cells"][:-1])), np.eye(8)[moves], time)
+        for part in range(P):
+            some = slice(B * part // P, B * (part + 1) // P)
+            mask = Mask(lengths[some], s["layers"], s["heads"], s["dropout"], self.updates, s["seed"], part)
+            policy += network(self.p, batch[some], s["heads"], mask)[0]["policy.mean"]
+        lam = math.exp(self.log_lambda[""][0])
+        L, H, loss = objective_of("categorical", [torch.cat(policy)], moves, remembered, w, lengths, None, lam)
+        g = torch.autograd.grad(L if s["method"] == "dt" else loss, list(self.p.values()))
+        for entry in accessed:
+            self.table.touch(entry)
+        values = {k: v.detach().numpy() for k, v in self.p.items()}
+        row["gradient_norm"] = self.theta.step(values, {k: x.numpy() for k, x in zip(values, g)})
+        self.p = {k: torch.tensor(v, requires_grad=True) for k, v in values.items()}
+        row["loss"] = float(L)
+        if s["method"] != "dt":
+            row["entropy"] = float(H)
+            self.temperature.step(self.log_lambda, {"": np.array([lam * (float(H) - s["eta"])])})
+        self.since.append(row)
+        self.updates += 1
+
+    def act(self, target, chance=None, episode=0):
+        """An episode: sampled, or, without chance, the most likely moves."""
+        s = self.s
+        told, context = [np.float32(target * s["reward_scale"])], min(s["eval_context"], s["context_length"])
+
+        def choose(e):
+            t = len(e["moves"])
+            if t > 0:
+                told.append(told[-1] - np.float32(e["rewards"][-1] * s["reward_scale"]))
+            steps = np.arange(max(0, t + 1 - context), t + 1)
+            window = (np.float64(told)[steps], self.normalised(e["cells"])[steps],
+                      np.eye(8)[e["moves"] + [0]][steps])  # the present step's action is not seen
+            window = [torch.tensor(x) for x in window] + [steps]
+            log_p = network(self.p, [window], s["heads"])[0]["policy.mean"][0][-1].detach().numpy()
+            if chance is not None:
+                return drawn(chance.uniform(episode, t), np.exp(log_p), np.arange(8))
+            return most_likely(log_p)
+        return grid_episode(choose, s["edge"])
+
+    def evaluate(self):
+        none = math.nan
+        of = lambda name: np.concatenate([[none]] + [np.atleast_1d(row[name]) for row in self.since if name in row])[1:]
+        mean = lambda x: np.mean(x) if len(x) else none
+        tried = [self.act(self.s["g_eval"]) for _ in range(self.s["eval_episodes"])]
+        fresh = self.episodes[self.rows[-1]["episodes"] if self.rows else 0:]
+        length = lambda episodes: mean([len(e["moves"]) for e in episodes])
+        total = lambda episodes: mean([sum(e["rewards"]) for e in episodes])
+        changes, self.changes = np.array(self.table.changes) - self.changes, np.array(self.table.changes)
+        shift = sum(row["shift"] for row in self.since) / len(self.since) if self.memory else none
+        self.rows.append({
+            "updates": self.updates, "interactions": self.interactions, "episodes": len(self.episodes),
+            "learning_rate": self.since[-1]["learning_rate"],
+            "lambda": none if self.s["method"] == "dt" else math.exp(self.log_lambda[""][0]),
+            "memory": len(self.table.entries), "eval_length": length(tried),
+            "eval_return": total(tried), "loss": mean(of("loss")), "entropy": mean(of("entropy")),
+            "gradient_norm": mean(of("gradient_norm")), "short": mean(of("short")), "unmatched": mean(of("unmatched")),
+            "rollout_length": length(fresh), "rollout_return": total(fresh),
+            "matched": changes[1] + changes[2], "evicted": changes[3], "advice": mean(of("advice")),
+            "advice_distance": mean(of("advice_distance")), "advice_shift": 0.5 * np.abs(shift).sum()})
+        self.since = []
+
+
+def run():
+    f = File("run", "WODTEM sec. IV-A, sec. IV-B and sec. V-D: the algorithm on the grid world, from data to the log")
+
+    def case(name, note, **given):
+        r = Run(**dict(SMALL, **given)).go()
+        outputs = {"progress/" + key: np.array([row[key] for row in r.rows]) for key in r.rows[0]}
+        if r.episodes:
+            each = lambda of: np.array([of(e) for e in r.episodes])
+            outputs.update({
+                "episodes/interactions": each(lambda e: e["interactions"]),
+                "episodes/length": each(lambda e: len(e["moves"])),
+                "episodes/return": each(lambda e: int(sum(e["rewards"]))),
+                "episodes/terminated": each(lambda e: int(e["cells"][-1] == 35)),
+                "episodes/actions": np.concatenate([e["moves"] for e in r.episodes])})
+        f.case(name, note, "float32 1e-05: tried in float32, this peer is off by 4e-07 at most", TORCH, {}, outputs,
+               **dict({key: SMALL[key] for key in ("seed", "layers", "heads", "width", "dropout")}, **given))
+
+    case("odt", "the order of a run: the trajectory of the lowest return is dropped; episode, updates, evaluation; one "
+         "warm-up over both phases; the buffer has room for one episode, then is overwritten from place 0 on; the last "
+         "episode overruns the budget, and an evaluation follows it", method="odt", seed=13, data_seed=113,
+         data_trajectories=12, context_length=1, eval_context=5, batch_size=16, learning_rate=0.01, warmup_updates=32,
+         lambda_learning_rate=0.01, offline_updates=20, online_steps=250, updates_per_iteration=4, buffer_size=12,
+         eval_every=2, eval_episodes=1)
+    case("dt", "DT on the grid world: moves, likelihood alone, no online phase; time-steps count from the episode's "
+         "start", method="dt", seed=5, data_seed=205, data_trajectories=8, heads=2, width=12, position="yes",
+         context_length=4, eval_context=3, batch_size=8, optimizer="adamw", weight_decay=0.1, learning_rate=0.01,
+         warmup_updates=10, offline_updates=30, updates_per_iteration=50, online_steps=0, buffer_size=500,
+         eval_every=10, eval_episodes=1)
+    case("wodtem", "the memory in a run: what it takes in when, its look-ups count as accesses, a full table; a batch "
+         "in three parts, each with its own dropout", method="wodtem", seed=15, data_seed=115, data_trajectories=20,
+         layers=2, heads=2, context_length=20, eval_context=5, batch_size=70, learning_rate=0.01, warmup_updates=5,
+         lambda_learning_rate=0.01, offline_updates=8, online_steps=190, updates_per_iteration=2, buffer_size=15,
+         eval_every=1, eval_episodes=1, gamma=0.99, alpha=0.75, K=3, epsilon=1.5, table_size=20)
+    case("wodtem_other_choices", "what the other cases leave as it is; online episodes overwrite all of the buffer. "
+         "Projected, the shifts (4, 1) and (3, 1) are the shortest, and no two neighbours are equally far, whose order "
+         "would be rounding's", method="wodtem", seed=2112, data_seed=9, data_trajectories=10, behaviour="left_down",
+         edge="excluded", keep_lowest="yes", sampling="by_length", heads=2, width=12, context_length=3, eval_context=2,
+         batch_size=16, dropout=0.25, learning_rate=0.02, warmup_updates=10, weight_decay=0.01, clip_norm=0.0625,
+         lambda_learning_rate=0.01, offline_updates=15, online_steps=300, updates_per_iteration=3, buffer_size=5,
+         eval_every=2, eval_episodes=2, g_online=1.5, g_eval=0.75, reward_scale=2, gamma=0.9, alpha=0.5, tau=0.5, K=3,
+         epsilon=0.05, projected_dim=2, table_size=24, keys="normalized", eviction="lru", exclude_self="yes")
+    f.save()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 # env_TASK: gym's and D4RL's rules around MuJoCo's own library, which a few lines of C open to Python. The robots'
 # models are data/*.xml but for maze2d's (the tests hold every number of them against tables); mazes are written here from their maps.
 
@@ -2080,7 +2363,7 @@ def maze2d(e, f, case):
 
 TOPICS = [rng, initialisation, returns, linear, layernorm, mlp, attention, tokens, policy_gaussian, policy_discrete,
           policy_deterministic, acting, memory_update, memory_lookup, memory_action, weights, objective, optimizer,
-          sampling, normalize, gridworld, step, environments]
+          sampling, normalize, gridworld, step, run, environments]
 
 if __name__ == "__main__":
     for make in TOPICS:
