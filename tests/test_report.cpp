@@ -1084,7 +1084,7 @@ TEST(stored_runs_redraw_the_figures_and_give_the_numbers_of_the_results_page) {
             if (read_file(drawn.path()) != read_file(shown)) report_failure(__FILE__, __LINE__, shown + " is another");
         }
     }
-    CHECK_EQUAL(figures, size_t{13});
+    CHECK_EQUAL(figures, size_t{14});
     for (const auto& [archive, runs_of, maze, count] : {std::tuple("maze2d-reduced", "large", "large", 19),
                                                         {"maze2d-umaze-flags", "umazeflags", "umaze, flags", 5}}) {
         const TemporaryFolder folder;
