@@ -7,7 +7,7 @@
 #   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable
 #   make sanitize         every test under AddressSanitizer and UndefinedBehaviorSanitizer, the threads under ThreadSanitizer
 #   make map              the map from the paper's equations to code, tests and vectors
-#   make mutants          which of some 375 one-line mistakes the golden vectors and the tests find; 15 minutes and more
+#   make mutants          which of some 390 one-line mistakes the golden vectors and the tests find; 15 minutes and more
 #   make faults           every call of the system and every allocation of eight commands made to fail; FAST=1: a few
 #   make fuzz             inputs made by libFuzzer for everything that is read, SECONDS=20 for each target; needs clang 19
 #   make endure           runs killed KILLS=500 times and continued, by 1 to 8 threads, and watched for growth

@@ -2,11 +2,13 @@
 // D4RL's layout has. In order: the planner; the walker; antmaze's rows; training to a level; replay and medium sets.
 #include <unistd.h>
 
+#include <cstring>
 #include <filesystem>
 #include <string>
 #include <vector>
 
 #include "../data/collect.hpp"
+#include "../data/info.hpp"
 #include "test.hpp"
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -374,6 +376,13 @@ TEST(training_ends_at_the_first_evaluation_near_its_level) {
         return learner;
     };
     CHECK_EQUAL(train("first", 1 << 30)->progress.updates, uint64_t{40});
+    LiveTask far(task);  // a policy far above the level is not at it
+    sac::Learner good(training.settings, far.spec(), one_thread());
+    Training low = training;
+    Moments returns;
+    low.level = 0.01;
+    CHECK(!is_at_level(good, far, low, returns));
+    CHECK(returns.mean() > 1);
     training.tolerance = 1e-9;  // never
     CHECK_FAILS("collect.stopped", train("never", 500));
     training.tolerance = 10;  // a run that goes on from a checkpoint at an evaluation evaluates there
@@ -477,6 +486,12 @@ TEST(a_replay_set_has_d4rls_layout) {
     CHECK(file.find("metadata/algorithm") && file.find("metadata/iteration") &&
           !file.find("metadata/policy/fc0/weight"));
     CHECK(!file.find("infos/action_log_probs"));
+    CHECK_EQUAL(file.read<float>(*file.find("metadata/iteration"))[0], 0.0f);  // 40 updates, counted in thousands
+    const std::string info = printed([&] { print_data_set(path, "hopper-medium-replay-v2"); });
+    const auto number_after = [&](const char* words) {
+        return std::stod(info.substr(info.find(words, info.find("physics 2.2 ")) + std::strlen(words)));
+    };
+    CHECK(number_after(" taken again end ") < number_after(" at most "));
     const Rows rows = read_rows(file);
     const std::vector<Trajectory> trajectories = cut_trajectories(rows, task, path);
     const DataSetStatistics s = statistics_of(rows, trajectories);

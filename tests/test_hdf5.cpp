@@ -243,6 +243,7 @@ TEST(hdf5_files_made_by_h5py_are_read) {
         CHECK(file.find("filters/fds")->filters == (std::vector{fletcher, deflate, shuffle}));
         CHECK_EQUAL(file.find("types/float32")->stored, size_t{60});
         CHECK_EQUAL(file.find("chunks/holes")->stored, size_t{16});
+        CHECK_EQUAL(file.find("chunks/fixed")->stored, size_t{4 * 3 * 2 * 4 * 4});  // whole chunks
         CHECK_EQUAL(read_text(file, *file.find("text/scalar")), "tanh_gaussian");
         for (const char* text : {"nul_ended", "nul_padded", "spaces"})
             CHECK_EQUAL(read_text(file, *file.find("text/" + std::string(text))), "relu");
@@ -600,6 +601,19 @@ TEST(hdf5_writer_refuses_what_does_not_fit) {
     int status = 0;
     CHECK(::waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 7);
     CHECK(std::filesystem::is_empty(folder.path));
+}
+
+// SPEC III.A.1: names of a child lie above the key on its left, up to that on its right; the library searches by them.
+TEST(a_written_group_has_the_keys_that_a_search_by_name_needs) {
+    const Folder folder;
+    const std::string path = folder / "out.hdf5";
+    Hdf5Writer out(path);
+    for (const char* name : {"b", "c", "a"}) out.add(name, {1}, std::array{1.0f});
+    out.close();
+    const std::string bytes = read_file(path);
+    const uint64_t tree = u64(bytes, 80), names = u64(bytes, u64(bytes, 88) + 24);
+    CHECK_EQUAL(std::string(&bytes[names + u64(bytes, tree + 24)]), "");
+    CHECK_EQUAL(std::string(&bytes[names + u64(bytes, tree + 40)]), "c");
 }
 
 TEST(hdf5_circles_end_in_errors) {

@@ -744,9 +744,23 @@ TEST(entropy_noise_is_drawn_for_each_step_of_each_update) {
     CHECK_EQUAL(whole.size(), size_t{64});
     CHECK(parts == whole);
     CHECK_EQUAL(std::set<float>(whole.begin(), whole.end()).size(), whole.size());
+    const Batch batch = sample_batch(run, 0, 32);
+    const Random random{static_cast<uint32_t>(settings.seed), Stream::entropy_noise};
+    for (uint32_t i = 0; i < 64; ++i) CHECK_EQUAL(whole[i], random.normal(0, batch.random_index[i / 2], i % 2));
     run.progress.updates += 1;
     const std::vector<float> next = entropy_noise(run, sample_batch(run, 0, 32));
     for (size_t i = 0; i < next.size(); ++i) CHECK(next[i] != whole[i]);
+}
+
+// Recorded actions may lie on the bound, where atanh is infinite.
+TEST(actions_on_the_bound_enter_tokens_and_likelihood_inside_it) {
+    const std::vector<float> actions = {-1, 1, 0.5f}, inside = {-1 + 1e-6f, 1 - 1e-6f, 0.5f};
+    std::vector<float> token(3), target(3), move(4);
+    write_action_token(token.data(), {2, 3, 0, 10}, actions.data());
+    write_action(target.data(), {2, 3, 0, 10}, actions.data());
+    CHECK(token == inside && target == inside);
+    write_action_token(move.data(), {2, 1, 4, 10}, &actions[1]);
+    CHECK(move == (std::vector<float>{0, 1, 0, 0}));
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -1682,6 +1696,7 @@ TEST(act_answers_with_the_actions_of_an_evaluation) {
     };
     const std::vector<std::string> twice = answers("0,1\\n0.5,0\\n\\n0,1\\n0.5,0\\n");
     CHECK(twice.size() == 5 && twice[2] == twice[0] && twice[3] == twice[1]);
+    CHECK(answers("0,1\\n0.5,0\\n \\t\\n0,1\\n0.5,0\\n") == twice);  // blanks look like nothing
     const std::string alone = answers("0.5,0\\n")[0];
     CHECK(twice[1] != alone);
     CHECK(own.reward_scale == 1e-3 && own.g_eval > 1000);  // a return is given in units of the reward
@@ -1846,6 +1861,7 @@ constexpr Edit edits[] = {{"progress.advice_shift", 7, NAN},
                           {"memory.age", shorter, 0},
                           {"memory.accesses", 0, 1e19},
                           {"memory.insertions", 0, 1e15},
+                          {"memory.insertions", 0, 36},
                           {"progress.online", 0, 2},
                           {"progress.updates", 0, 1e15},
                           {"progress.updates", 0, 7},
@@ -2422,6 +2438,9 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
     CHECK_FAILS("run.stopped", quiet_train(settings, scratch / "renamed", 2));
     stop_requested = 0;
     settings.dataset = " my set # 2\n.hdf5";  // another name for the same data: the same run
+    Settings chosen = settings;
+    choose_data_set(chosen, data, nullptr);  // whatever its name, it is not D4RL's
+    CHECK_EQUAL(chosen.source["dataset"], "not known as a published file");
     quiet_train(settings, scratch / "renamed", 2);
     const std::vector<std::string> last = results::Log(scratch / "renamed/progress.csv").table.rows.back();
     check_shell("./wodtem eval " + (scratch / "renamed") + " --record " + (scratch / "made.hdf5"), 0,
@@ -2468,6 +2487,10 @@ TEST(a_run_on_a_collected_data_set_is_the_same_when_it_is_interrupted) {
 TEST(every_method_and_physics_trains_on_continuous_actions) {
     const Scratch scratch;
     for (const char* method : {"dt", "odt"}) quiet_train(tiny_mujoco_settings("hopper-v2", method), scratch / method);
+    // Fewer episodes of the last evaluation are its first ones.
+    const std::string eval = "./wodtem eval " + (scratch / "odt"), only = " | grep ^episode";
+    const std::string two = shell(eval + " --episodes 2" + only).text, three = shell(eval + only).text;
+    CHECK(three.starts_with(two) && three.size() > two.size() && two.starts_with("episode 1: "));
     Settings settings = tiny_mujoco_settings("hopper-v2", "odt");
     settings.physics = "2.2";
     CHECK_FAILS("run.other_settings", quiet_train(settings, scratch / "odt"));
