@@ -121,8 +121,8 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
 }
 
 // '; the nearest is "NAME"' for the end of a sentence; nothing where none of the names is near: where more than half of
-// the letters would have to change, and neither is a part of the other; or where the text is so long that looking takes
-// long.
+// the letters would have to change, and neither is a part of the other; or where the text has more than 200
+// bytes, for which the distances would take long.
 inline std::string nearest_hint(const std::string& name, const std::vector<std::string>& names) {
     if (name.size() > 200) return "";
     const std::string nearest = nearest_name(name, names);

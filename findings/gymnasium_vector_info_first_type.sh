@@ -14,8 +14,8 @@
 #           gives the data of all sub-environments; neither it nor the docstrings name the type.
 # Versions: gymnasium 1.4.0 (the newest), metaworld 3.1.1 (the newest; it asks for mujoco 3.3.0), numpy 2.4.6;
 #           CPython 3.11, x86-64 Linux. Seen on 2026-12-01.
-# Matters:  success, progress and cost of an evaluation are read from infos. They come out too small, and which of them
-#           do depends on what the environment with the lowest number happens to report in the same step.
+# Matters:  success, progress and cost of an evaluation are read from infos. They come out wrong, mostly too small, and
+#           which of them do depends on what the environment with the lowest number happens to report in the same step.
 # Way out:  a wrapper around each sub-environment that makes every number in info a float.
 #
 # Output seen on 2026-12-01:

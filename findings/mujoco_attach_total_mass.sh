@@ -19,7 +19,7 @@
 # Way out:  scale the density of the child's geoms by the same factor before attaching, which gives the masses and the
 #           motion to rounding; or set the parent's settotalmass, if the scene holds no other body with mass.
 #
-# Output seen on 2026-12-01 (4.0.0; that of 3.17.0 is the same but for 8e-08):
+# Output seen on 2026-12-01 (4.0.0; that of 3.17.0 has 8e-08 m where this has 1e-07 m):
 #   mujoco 4.0.0, gymnasium 1.4.0, numpy 2.4.6
 #     alone 14.0000 kg, capsules by hand 21.1837 kg, attached 21.1837 kg, attach_body 21.1837 kg
 #     <attach> 21.1837 kg, two of them 42.3674 kg; named by the warnings: timestep, nuser_geom

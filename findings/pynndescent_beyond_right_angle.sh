@@ -5,8 +5,8 @@
 #           says, and as SciPy, scikit-learn and that very function have it. The nearest keys are returned even if they
 #           lie on the other side of the origin.
 # Seen:     a query that has no key within 90 degrees gets ten arbitrary keys, each with the distance 1 exactly. Their
-#           true distances go up to 1.91, while the nearest keys are at 1.00 to 1.37: of 2000 keys, 4 % of the ten
-#           nearest are found. On the keys' side of the origin it is 99.5 %, and the distances are right. "dot" on unit
+#           true distances go up to 1.91, while the nearest keys are at 1.00 to 1.37: 4 % of the ten nearest of 2000
+#           keys are found. On the keys' side of the origin it is 99.5 %, and the distances are right. "dot" on unit
 #           vectors is the same as "cosine". "inner_product", which the docstring of "dot" recommends, gives all keys
 #           with a negative inner product the distance 0; it finds 6 % of the largest ones if they are negative. The
 #           approximate search is not to blame: on the same arrays (the rows have mean 0) "correlation" finds all, and
@@ -14,8 +14,8 @@
 #           90 degrees, these come first, and the other 6 of the ten are arbitrary. There is no message. The cause: the
 #           search takes log2(1 / cos) instead, and the largest float32 where cos <= 0, so these keys are tied. Only the
 #           docstrings of the internal functions and of "dot" tell; those of NNDescent and of "cosine" do not.
-# Versions: pynndescent 0.7.0 (the newest; "cosine" and "dot" of 0.5.13 are alike), numba 0.68.1, scikit-learn 1.9.1,
-#           numpy 2.4.6; CPython 3.11, x86-64 Linux. Seen on 2026-12-01.
+# Versions: pynndescent 0.7.0 (the newest; "cosine" and "dot" of 0.5.13, tried by hand, are alike), numba 0.68.1,
+#           scikit-learn 1.9.1, numpy 2.4.6; CPython 3.11, x86-64 Linux. Seen on 2026-12-01.
 # Matters:  the memory holds the keys of the offline data, with the mean taken off. An agent that goes online elsewhere
 #           asks from the other side of the origin. It should get the least dissimilar memories, and gets random ones of
 #           equal weight. Where every step costs, features times task weights are negative for all memories, and the

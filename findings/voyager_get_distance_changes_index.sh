@@ -5,8 +5,9 @@
 #           of query() are. It depends on a and b alone, and reading a distance leaves the index as it is.
 # Seen:     1. It is 1 - a.b - floor(sqrt(m^2 - |a|^2)) floor(sqrt(m^2 - |b|^2)), where m is the largest length among
 #              all vectors that the index has met. One pair of vectors has the distance 0.457 in an empty index, -24.5
-#              in one with 2000 others, and -1295.5 after a vector six times as long as those. The order is another one,
-#              too: 23 % of the ten keys nearest by get_distance() are so by 1 - a.b. query() itself gives 1 - a.b.
+#              in one with 2000 others, and -1295.5 after a vector nearly six times as long as the longest of those. The
+#              order is another one, too: 23 % of the ten keys nearest by get_distance() are so by 1 - a.b. query()
+#              itself gives 1 - a.b.
 #           2. m takes in the vectors given to get_distance() as well. One call with a long vector, which is not added
 #              to the index, changes all later distances. Moreover, what is added after it is stored with a coordinate
 #              made from m: of the same 2000 vectors, with such a call half-way, query() finds 37 % of the ten nearest

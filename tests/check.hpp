@@ -1642,13 +1642,14 @@ Settings run_settings(Case& c) {
     apply_assignments(settings, assignments);
     settings.seed = c.whole("seed", 0, 0, 0xFFFFFFFF);
     check_together(settings);
-    // At most so many updates and tokens, for episodes of 5 steps in the online phase and of 100 in evaluations.
-    const double episodes = std::ceil(static_cast<double>(settings.online_steps) / 5);
+    // At most so many updates and tokens: online episodes are as short as can be, evaluated ones as long as can be.
+    const double shortest = settings.edge == "wraps" ? 1 : 5;
+    const double episodes = std::ceil(static_cast<double>(settings.online_steps) / shortest);
     const double updates =
         static_cast<double>(settings.offline_updates) + episodes * static_cast<double>(settings.updates_per_iteration);
     const double evaluations = 1 + episodes / static_cast<double>(settings.eval_every);
     const double steps = updates * static_cast<double>(settings.batch_size * settings.context_length) +
-                         (5 * episodes + 100 * evaluations * static_cast<double>(settings.eval_episodes)) *
+                         (shortest * episodes + 100 * evaluations * static_cast<double>(settings.eval_episodes)) *
                              static_cast<double>(std::min(settings.eval_context, settings.context_length));
     const double width = static_cast<double>(settings.width),
                  longest = static_cast<double>(3 * settings.context_length);

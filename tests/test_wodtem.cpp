@@ -4,6 +4,7 @@
 #include <sys/stat.h>
 #include <sys/wait.h>
 
+#include <ctime>
 #include <fstream>
 
 #define WODTEM_NO_MAIN
