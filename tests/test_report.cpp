@@ -1086,7 +1086,7 @@ TEST(stored_runs_redraw_the_figures_and_give_the_numbers_of_the_results_page) {
     }
     CHECK_EQUAL(figures, size_t{14});
     for (const auto& [archive, runs_of, maze, count] : {std::tuple("maze2d-reduced", "large", "large", 19),
-                                                        {"maze2d-umaze-flags", "umazeflags", "umaze, flags", 5}}) {
+                                                        {"maze2d-umaze-flags", "umazeflags", "umaze, flags", 15}}) {
         const TemporaryFolder folder;
         const std::string file = "data/results/" + std::string(archive) + ".tar.gz";
         CHECK_EQUAL(std::system(("tar -xzf " + file + " -C " + folder.path).c_str()), 0);
