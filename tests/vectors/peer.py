@@ -2013,32 +2013,35 @@ def run():
                 "episodes/return": each(lambda e: int(sum(e["rewards"]))),
                 "episodes/terminated": each(lambda e: int(e["cells"][-1] == 35)),
                 "episodes/actions": np.concatenate([e["moves"] for e in r.episodes])})
-        f.case(name, note, "float32 1e-05: tried in float32, this peer is off by 4e-07 at most", TORCH, {}, outputs,
+        f.case(name, note, "float32 1e-05: tried in float32, this peer was off by 6e-07 at most", TORCH, {}, outputs,
                **dict({key: SMALL[key] for key in ("seed", "layers", "heads", "width", "dropout")}, **given))
+        for key, bound in (("loss", 1e-4), ("entropy", 1e-4), ("gradient_norm", 1e-3)):
+            f.tolerance(name, "progress/" + key, f"float32 {bound:.2g}: what errors of 1e-6 in the gradients came to")
 
+    # Targets far from the returns of the data, and large steps: so the moves tell which target and context were used.
     case("odt", "the order of a run: the trajectory of the lowest return is dropped; episode, updates, evaluation; one "
          "warm-up over both phases; the buffer has room for one episode, then is overwritten from place 0 on; the last "
-         "episode overruns the budget, and an evaluation follows it", method="odt", seed=13, data_seed=113,
-         data_trajectories=12, context_length=1, eval_context=5, batch_size=16, learning_rate=0.01, warmup_updates=32,
+         "episode overruns the budget, and one evaluation follows it", method="odt", seed=61, data_seed=161,
+         data_trajectories=12, context_length=1, eval_context=5, batch_size=16, learning_rate=0.02, warmup_updates=32,
          lambda_learning_rate=0.01, offline_updates=20, online_steps=250, updates_per_iteration=4, buffer_size=12,
-         eval_every=2, eval_episodes=1)
+         eval_every=2, eval_episodes=1, g_online=-4, g_eval=1)
     case("dt", "DT on the grid world: moves, likelihood alone, no online phase; time-steps count from the episode's "
-         "start", method="dt", seed=5, data_seed=205, data_trajectories=8, heads=2, width=12, position="yes",
-         context_length=4, eval_context=3, batch_size=8, optimizer="adamw", weight_decay=0.1, learning_rate=0.01,
-         warmup_updates=10, offline_updates=30, updates_per_iteration=50, online_steps=0, buffer_size=500,
-         eval_every=10, eval_episodes=1)
+         "start; acting has a context of its own", method="dt", seed=5, data_seed=205, data_trajectories=8, heads=2,
+         width=12, position="yes", context_length=4, eval_context=3, batch_size=8, optimizer="adamw", weight_decay=0.1,
+         learning_rate=0.02, warmup_updates=10, offline_updates=30, updates_per_iteration=50, online_steps=0,
+         buffer_size=500, eval_every=10, eval_episodes=1)
     case("wodtem", "the memory in a run: what it takes in when, its look-ups count as accesses, a full table; a batch "
-         "in three parts, each with its own dropout", method="wodtem", seed=15, data_seed=115, data_trajectories=20,
-         layers=2, heads=2, context_length=20, eval_context=5, batch_size=70, learning_rate=0.01, warmup_updates=5,
-         lambda_learning_rate=0.01, offline_updates=8, online_steps=190, updates_per_iteration=2, buffer_size=15,
+         "in three parts, each with its own dropout", method="wodtem", seed=7, data_seed=107, data_trajectories=20,
+         layers=2, heads=2, context_length=20, eval_context=5, batch_size=70, learning_rate=0.03, warmup_updates=5,
+         lambda_learning_rate=0.01, offline_updates=8, online_steps=120, updates_per_iteration=2, buffer_size=15,
          eval_every=1, eval_episodes=1, gamma=0.99, alpha=0.75, K=3, epsilon=1.5, table_size=20)
     case("wodtem_other_choices", "what the other cases leave as it is; online episodes overwrite all of the buffer. "
          "Projected, the shifts (4, 1) and (3, 1) are the shortest, and no two neighbours are equally far, whose order "
          "would be rounding's", method="wodtem", seed=2112, data_seed=9, data_trajectories=10, behaviour="left_down",
          edge="excluded", keep_lowest="yes", sampling="by_length", heads=2, width=12, context_length=3, eval_context=2,
-         batch_size=16, dropout=0.25, learning_rate=0.02, warmup_updates=10, weight_decay=0.01, clip_norm=0.0625,
+         batch_size=16, dropout=0.25, learning_rate=0.0575, warmup_updates=10, weight_decay=0.01, clip_norm=0.0625,
          lambda_learning_rate=0.01, offline_updates=15, online_steps=300, updates_per_iteration=3, buffer_size=5,
-         eval_every=2, eval_episodes=2, g_online=1.5, g_eval=0.75, reward_scale=2, gamma=0.9, alpha=0.5, tau=0.5, K=3,
+         eval_every=5, eval_episodes=2, g_online=-1, g_eval=3, reward_scale=4, gamma=0.9, alpha=0.5, tau=0.5, K=3,
          epsilon=0.05, projected_dim=2, table_size=24, keys="normalized", eviction="lru", exclude_self="yes")
     f.save()
 
