@@ -1,7 +1,7 @@
 # WODTEM: a reference implementation in one binary. Needs g++ (12 or newer) and, for all tasks but the grid world, MuJoCo
 # 2.2; both are installed with apt where they are missing. Without MuJoCo the grid world still builds.
 #
-#   make run              build, train DT, ODT and WODTEM on the grid world (one to two minutes), show the report
+#   make run              build, train DT, ODT and WODTEM on the grid world (about a minute), show the report
 #   make test             build and run every test; the last line is "N passed, N failed"
 #   make                  build ./wodtem alone
 #   make paper-gridworld  the paper's grid world as printed (width 512), five seeds of each method; hours, resumable

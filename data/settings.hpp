@@ -76,8 +76,12 @@ inline std::vector<double> numbers_between_commas(const std::string& line, const
     return values;
 }
 
-// A text as a sentence quotes it: no more than its first 200 bytes.
-inline std::string excerpt(const std::string& text) { return text.size() > 200 ? text.substr(0, 200) + "..." : text; }
+constexpr size_t most_quoted = 200;  // bytes of a given text in a sentence
+
+// A text as a sentence quotes it.
+inline std::string excerpt(const std::string& text) {
+    return text.size() > most_quoted ? text.substr(0, most_quoted) + "..." : text;
+}
 
 // The number in a text, from `low` to `high`, and whole if it must be. Errors: `id` with the range and the nearest
 // number in it; `name` begins the sentence.
@@ -121,10 +125,10 @@ inline std::string nearest_name(const std::string& name, const std::vector<std::
 }
 
 // '; the nearest is "NAME"' for the end of a sentence; nothing where none of the names is near: where more than half of
-// the letters would have to change, and neither is a part of the other; or where the text has more than 200
-// bytes, for which the distances would take long.
+// the letters would have to change, and neither is a part of the other; or where the text is longer than most_quoted,
+// for which the distances would take long.
 inline std::string nearest_hint(const std::string& name, const std::vector<std::string>& names) {
-    if (name.size() > 200) return "";
+    if (name.size() > most_quoted) return "";
     const std::string nearest = nearest_name(name, names);
     const bool part = nearest.find(name) != std::string::npos || name.find(nearest) != std::string::npos;
     const size_t longer = std::max(name.size(), nearest.size());

@@ -1662,38 +1662,35 @@ Settings run_settings(Case& c) {
     return settings;
 }
 
-// The lines of a log, as lists by column: numbers, NaN where there is none.
-void add_columns(std::map<std::string, std::vector<double>>& columns, const std::string& header,
-                 const std::string& line) {
-    const std::vector<std::string> names = split(trimmed(header), ','), fields = split(trimmed(line), ',');
-    for (size_t i = 0; i < names.size(); ++i) {
-        std::vector<double>& column = columns[names[i]];
-        if (names[i] == "actions")
-            for (const char move : fields[i]) column.push_back(move - '0');
-        else
-            column.push_back(to_number(fields[i]).value_or(NAN));
+// Compares the columns of a log that the file has: numbers, NaN where there is none; actions [interactions], the moves.
+void expect_columns(Case& c, const std::string& log, const std::string& text) {
+    const results::Log lines(log, text);
+    for (const std::string& name : lines.table.header) {
+        std::vector<double> column;
+        for (const std::string& field : lines.texts(name.c_str()))
+            if (name == "actions")
+                for (const char move : field) column.push_back(move - '0');
+            else
+                column.push_back(to_number(field).value_or(NAN));
+        c.expect(log + "/" + name, shape_of(column.size()), column, true);
     }
 }
 
 // A run from its data set to its last evaluation. -> progress/NAME [evaluations], episodes/NAME [episodes]: columns of
-// progress.csv and episodes.csv, as they would be written; episodes/actions [interactions].
+// progress.csv and episodes.csv, as they would be written.
 void check_run(Case& c) {
     const Settings settings = run_settings(c);
-    std::map<std::string, std::vector<double>> progress, episodes;
+    std::string progress = progress_header, episodes = episodes_header;
     Observer observer;
-    observer.evaluated = [&](const ProgressRow& row, const Evaluation&) {
-        add_columns(progress, progress_header, progress_line(row, settings));
-    };
-    observer.played = [&](const EpisodeRow& row) {
-        add_columns(episodes, episodes_header, episode_line(row, settings));
-    };
+    observer.evaluated = [&](const ProgressRow& row, const Evaluation&) { progress += progress_line(row, settings); };
+    observer.played = [&](const EpisodeRow& row) { episodes += episode_line(row, settings); };
     observer.pause = [](double) {};
     Run run(c.compute, settings, *make_environment(settings));
     begin_run(run, make_data_set(settings));
     offline_phase(run, observer);
     if (settings.online_steps > 0) online_phase(run, observer);
-    for (const auto& [name, column] : progress) c.expect("progress/" + name, shape_of(column.size()), column, true);
-    for (const auto& [name, column] : episodes) c.expect("episodes/" + name, shape_of(column.size()), column, true);
+    expect_columns(c, "progress", progress);
+    expect_columns(c, "episodes", episodes);
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
